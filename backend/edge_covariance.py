@@ -124,10 +124,7 @@ def _linearise(
     uv, sigma = submap.observed_pixels(rows)
     K, z = submap.K, x[:, 2]
     residual = np.stack(
-        (
-            (K[0, 0] * x[:, 0] + K[0, 1] * x[:, 1]) / z + K[0, 2] - uv[:, 0],
-            K[1, 1] * x[:, 1] / z + K[1, 2] - uv[:, 1],
-        ),
+        ((K[0, 0] * x[:, 0] + K[0, 1] * x[:, 1]) / z + K[0, 2] - uv[:, 0], K[1, 1] * x[:, 1] / z + K[1, 2] - uv[:, 1]),
         1,
     )
     chi2 = (residual**2).sum(axis=1) / sigma**2

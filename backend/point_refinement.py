@@ -96,12 +96,7 @@ def refit_points(submap: Submap, robust_k: float, landmark_ids: IntArray) -> Flo
 
 
 def triangulation_covariances(
-    K: FloatArray,
-    T_submap_kf: FloatArray,
-    pose: IntArray,
-    xyz_mu: FloatArray,
-    point: IntArray,
-    sigma_px: FloatArray,
+    K: FloatArray, T_submap_kf: FloatArray, pose: IntArray, xyz_mu: FloatArray, point: IntArray, sigma_px: FloatArray
 ) -> FloatArray:
     """Return (P, 3, 3): the covariance of each point by its views alone, the poses taken as known; NaN without a depth.
 

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from dualslam.backend.observability import take_mask
+from dualslam.core.firsts import rank_in_runs
 from dualslam.core.types import BoolArray, FloatArray, IntArray
 
 CELLS_ACROSS = 16
@@ -32,13 +33,6 @@ class Candidates:
     landmark: IntArray  # (R,)
     uv_px: FloatArray  # (R, 2)
     width_px: float  # of the image, about
-
-
-def rank_in_runs(key: IntArray) -> IntArray:
-    """Return for each entry of a sorted array its place among those equal to it."""
-    start = np.flatnonzero(np.concatenate(([True], key[1:] != key[:-1]))) if len(key) else np.zeros(0, np.int64)
-    lengths = np.diff(np.append(start, len(key)))
-    return np.asarray(np.arange(len(key)) - np.repeat(start, lengths), np.int64)
 
 
 def spread_evenly(rank: IntArray, n: IntArray, quota: IntArray) -> BoolArray:
@@ -163,12 +157,7 @@ class _Cells:
 
 
 def _top_up(
-    candidates: Candidates,
-    admitted: BoolArray,
-    chosen: BoolArray,
-    factors: BoolArray,
-    views: IntArray,
-    min_views: int,
+    candidates: Candidates, admitted: BoolArray, chosen: BoolArray, factors: BoolArray, views: IntArray, min_views: int
 ) -> None:
     """Give landmarks that lost views others in their stead, and drop those that are left with fewer than two."""
     landmark = candidates.landmark

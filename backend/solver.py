@@ -12,13 +12,14 @@ newest pose suffered. All variables are therefore checked, but not each time.
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import gtsam
 import numpy as np
 
 from dualslam.backend import convert
-from dualslam.backend.bayes_tree import BayesTree, UpdateStatistics, parse_bayes_tree
 from dualslam.core.types import FloatArray, IntArray
 
 POSE_THRESHOLDS = (0.0015, 0.0075)
@@ -47,6 +48,15 @@ class SolverFailure(Exception):  # noqa: N818 - caught inside backend, never lea
             return cls(f"nothing fixes {kind} {number}, or others that hang on it", key)
         lines = [line.strip() for line in str(error).splitlines() if line.strip()]
         return cls(" ".join(lines[:2])[:200] if lines else type(error).__name__, key)
+
+
+@contextmanager
+def naming_failure() -> Iterator[None]:
+    """Raise what GTSAM raises as a `SolverFailure`."""
+    try:
+        yield
+    except GTSAM_ERRORS as error:
+        raise SolverFailure.of(error) from error
 
 
 class IncrementalSolver:
@@ -87,11 +97,9 @@ class IncrementalSolver:
             last.insert2(convert.pose_key(k), 1)
         params.constrainedKeys = last
         params.force_relinearize = relinearise
-        try:
+        with naming_failure():
             result = self._isam.update(graph, values, params)
             cliques, indices = result.getCliques(), result.getNewFactorsIndices()
-        except GTSAM_ERRORS as error:
-            raise SolverFailure.of(error) from error
         if cliques == 0:
             raise SolverFailure("the solver is dead (no cliques)")
         self.statistics = UpdateStatistics(
@@ -101,21 +109,17 @@ class IncrementalSolver:
 
     def pose(self, keyframe_id: int) -> FloatArray:
         """Return the (4, 4) estimate of one pose."""
-        try:
+        with naming_failure():
             return convert.from_pose3(self._isam.calculateEstimatePose3(convert.pose_key(keyframe_id)))
-        except GTSAM_ERRORS as error:
-            raise SolverFailure.of(error) from error
 
     def estimate(self, keyframes: IntArray, landmarks: IntArray, everything: bool) -> tuple[FloatArray, FloatArray]:
         """Return (K, 4, 4) poses and (L, 3) points of ascending ids; `everything` says that they are all there are."""
-        try:
+        with naming_failure():
             if everything:
                 values = self._isam.calculateEstimate()
             else:
                 values = self._isam.calculateEstimate(landmarks.tolist() + convert.pose_keys(keyframes))
             T, xyz = convert.poses_of(values), convert.points_of(values)
-        except GTSAM_ERRORS as error:
-            raise SolverFailure.of(error) from error
         if len(T) != len(keyframes) or len(xyz) != len(landmarks):
             raise SolverFailure(
                 f"the solver holds {len(T)} poses and {len(xyz)} points where {len(keyframes)} and {len(landmarks)} "
@@ -131,17 +135,13 @@ class IncrementalSolver:
 
     def bayes_tree(self) -> BayesTree:
         """Return the current tree."""
-        try:
+        with naming_failure():
             return parse_bayes_tree(self._isam.dot())
-        except GTSAM_ERRORS as error:
-            raise SolverFailure.of(error) from error
 
     def covariance(self, key: int) -> FloatArray:
         """Return the marginal covariance of one variable."""
-        try:
+        with naming_failure():
             return np.asarray(self._isam.marginalCovariance(key), float)
-        except GTSAM_ERRORS as error:
-            raise SolverFailure.of(error) from error
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -173,7 +173,7 @@ def optimise_batch(
     params.setRelativeErrorTol(tolerance)
     params.setLinearSolverType("SEQUENTIAL_CHOLESKY")
     params.setOrdering(gtsam.Ordering(landmarks.tolist() + convert.pose_keys(keyframes)))
-    try:
+    with naming_failure():
         optimizer = gtsam.LevenbergMarquardtOptimizer(graph, values, params)
         before = float(optimizer.error())
         result = optimizer.optimize()
@@ -185,8 +185,79 @@ def optimise_batch(
             result = optimizer.optimize()
         T, xyz = convert.poses_of(result), convert.points_of(result)
         after = float(optimizer.error())
-    except GTSAM_ERRORS as error:
-        raise SolverFailure.of(error) from error
     if not (np.isfinite(T).all() and np.isfinite(xyz).all()):
         raise SolverFailure("the batch estimate is not finite")
     return BatchOptimum(T, xyz, before, after)
+
+
+_NODE = re.compile(r'^(\d+)\[label="([^"]*)"\];$')
+_EDGE = re.compile(r"^(\d+)->(\d+)$")
+
+
+@dataclass(frozen=True, slots=True)
+class UpdateStatistics:
+    """Effect of one step of the incremental solver."""
+
+    relinearised: int  # variables that had moved beyond their threshold and got a new linearisation
+    reeliminated: int  # variables whose conditional was computed anew
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BayesTree:
+    """The square-root information matrix as a tree: each clique is p(frontal variables | separator)."""
+
+    parent: IntArray
+    """(C,): clique above each one, -1 for a root. Parents come before their children."""
+    # Frontal variables of each clique.
+    keyframes: tuple[tuple[int, ...], ...]
+    landmarks: tuple[tuple[int, ...], ...]
+    separators: tuple[tuple[int, ...], ...]
+    """Keyframes that each clique is conditioned on; they are frontal somewhere above it."""
+    separator_landmarks: IntArray  # (C,): how many landmarks it is conditioned on besides
+
+    def __len__(self) -> int:
+        return len(self.parent)
+
+    @property
+    def depth(self) -> IntArray:
+        """(C,) number of cliques above each one."""
+        depth = np.zeros(len(self), np.int64)
+        for clique, above in enumerate(self.parent.tolist()):
+            depth[clique] = 0 if above < 0 else depth[above] + 1
+        return depth
+
+
+def parse_bayes_tree(dot: str) -> BayesTree:
+    """Read the text that `gtsam.ISAM2.dot` writes: the tree itself is not within reach from Python."""
+    labels: dict[str, str] = {}
+    above: dict[str, str] = {}
+    for line in dot.splitlines():
+        if node := _NODE.match(line.strip()):
+            labels[node.group(1)] = node.group(2)
+        elif edge := _EDGE.match(line.strip()):
+            above[edge.group(2)] = edge.group(1)
+    children: dict[str, list[str]] = {}
+    for name in labels:
+        children.setdefault(above.get(name, ""), []).append(name)
+    ordered: list[str] = []
+    waiting = list(reversed(children.get("", [])))
+    while waiting:
+        name = waiting.pop()
+        ordered.append(name)
+        waiting += reversed(children.get(name, []))
+    row = {name: i for i, name in enumerate(ordered)}
+    variables = [[_split(part) for part in (labels[name] + ":").split(":")[:2]] for name in ordered]
+    return BayesTree(
+        parent=np.array([row[above[name]] if name in above else -1 for name in ordered], np.int64),
+        keyframes=tuple(frontal[0] for frontal, _ in variables),
+        landmarks=tuple(frontal[1] for frontal, _ in variables),
+        separators=tuple(separator[0] for _, separator in variables),
+        separator_landmarks=np.array([len(separator[1]) for _, separator in variables], np.int64),
+    )
+
+
+def _split(variables: str) -> tuple[tuple[int, ...], tuple[int, ...]]:
+    """Return keyframes (``x3``) and landmarks (``12``) of a list of variables."""
+    names = [name.strip() for name in variables.split(",") if name.strip()]
+    keyframes = tuple(int(name[1:]) for name in names if name.startswith("x"))
+    return keyframes, tuple(int(name) for name in names if not name.startswith("x"))

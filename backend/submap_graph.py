@@ -16,16 +16,27 @@ import gtsam
 import numpy as np
 
 from dualslam.backend import convert
-from dualslam.backend.bayes_tree import BayesTree, UpdateStatistics
 from dualslam.backend.factor_index import INSERT_SIGMAS, FactorIndex, Plan
-from dualslam.backend.factors import insert_projections
 from dualslam.backend.noise import LEAST_NOISE, OUTLIER_CHI2, PixelNoise, residual_variance
 from dualslam.backend.observability import compute_residuals, take_mask
 from dualslam.backend.point_refinement import refine_points
-from dualslam.backend.points_beside import landmarks_beside, triangulated_covariances, views_of
-from dualslam.backend.reading import READ_ALL, READ_WINDOW, choose_part
-from dualslam.backend.solver import N_LAST, IncrementalSolver, SolverFailure, optimise_batch
-from dualslam.backend.ties import TieChanges, Ties
+from dualslam.backend.reading import (
+    READ_ALL,
+    READ_WINDOW,
+    choose_part,
+    landmarks_beside,
+    triangulated_covariances,
+    views_of,
+)
+from dualslam.backend.solver import (
+    N_LAST,
+    BayesTree,
+    IncrementalSolver,
+    SolverFailure,
+    UpdateStatistics,
+    optimise_batch,
+)
+from dualslam.backend.ties import TieChanges, Ties, insert_projections
 from dualslam.core.config.settings import GraphConfig
 from dualslam.core.errors import SolverError
 from dualslam.core.estimates import GraphEstimate

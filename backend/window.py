@@ -16,8 +16,9 @@ import numpy as np
 from dualslam.backend.noise import LEAST_NOISE, OUTLIER_CHI2, residual_variance
 from dualslam.backend.observability import projection_jacobian, reproject
 from dualslam.backend.point_refinement import huber, normal_equations
-from dualslam.backend.selection import rank_in_runs, spread_evenly
+from dualslam.backend.selection import spread_evenly
 from dualslam.core.estimates import GraphEstimate
+from dualslam.core.firsts import rank_in_runs
 from dualslam.core.geometry import se3, so3
 from dualslam.core.sums import sum_by
 from dualslam.core.types import Failure, FailureReason, FloatArray, IntArray
@@ -169,13 +170,7 @@ def adjust_window(window: Window, robust_k: float, iterations: int = ITERATIONS)
 
 
 def _step(
-    state: _State,
-    U: FloatArray,
-    V: FloatArray,
-    W: FloatArray,
-    g_pose: FloatArray,
-    g_point: FloatArray,
-    damping: float,
+    state: _State, U: FloatArray, V: FloatArray, W: FloatArray, g_pose: FloatArray, g_point: FloatArray, damping: float
 ) -> tuple[FloatArray, FloatArray]:
     """Return poses and points moved by one damped step."""
     n_free = len(U)

@@ -41,12 +41,7 @@ class Candidate:
         return isinstance(view, View) and bool(self.starter.add(view))
 
 
-def choose_frontend(
-    frames: Iterable[Frame],
-    corners: Candidate,
-    blobs: Candidate,
-    n_features: int,
-) -> FrontendChoice:
+def choose_frontend(frames: Iterable[Frame], corners: Candidate, blobs: Candidate, n_features: int) -> FrontendChoice:
     """Choose between corners and blobs by a sequence's first frames.
 
     Blobs cost several times the CPU. They are chosen where images show few corners and blobs are the first to start a

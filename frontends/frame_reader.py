@@ -9,8 +9,7 @@ from dualslam.core.camera.rectification import rectify
 from dualslam.core.grey_image import GreyImage
 from dualslam.core.interfaces import Frontend, Shutter
 from dualslam.core.types import Failure, FailureReason, Frame, LateFrame, View
-from dualslam.frontends.asking import checked
-from dualslam.frontends.features.images import to_grey
+from dualslam.frontends.features.images import checked, to_grey
 from dualslam.frontends.scene_mask import Cover, SceneMask
 
 

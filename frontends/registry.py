@@ -8,7 +8,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from importlib.metadata import entry_points
 from importlib.util import find_spec
-from typing import Any, Protocol, TypeVar
+from typing import Any, ClassVar, Protocol, Self, TypeVar
 
 from pydantic import BaseModel, ValidationError
 
@@ -81,11 +81,6 @@ class FrontendFactory(Protocol):
     def from_options(self, n_features: int, options: Mapping[str, Any]) -> Frontend:
         """Build the front end; raise ConfigError where an option is unknown or out of range."""
         ...
-
-
-def known_frontends() -> list[str]:
-    """Names that `create_frontend` accepts, sorted."""
-    return FRONTENDS.known
 
 
 class PixelMatcherFactory(Protocol):
@@ -209,3 +204,22 @@ def _import(name: str, kind: Kind) -> Any:
         return entry.load()
     known = ", ".join(kind.known) or "none"
     raise ConfigError(f"no {kind.noun} is called '{name}'{nearest_of(name, kind.known)}; known: {known}", field)
+
+
+class OptionedFrontend:
+    """A front end that is made of a number of features and its own strict options.
+
+    `n_features`: keypoints per image, at most.
+    """
+
+    name: str
+    options_model: ClassVar[type[BaseModel]]  # of its options
+
+    def __init__(self, n_features: int = 1500, options: Any = None) -> None:
+        self.n_features = n_features
+        self.options = options or self.options_model()
+
+    @classmethod
+    def from_options(cls, n_features: int, options: Mapping[str, Any]) -> Self:
+        """Build from the config; ConfigError names an option that is unknown, out of range or cannot be met."""
+        return cls(n_features, parse_options(cls.options_model, cls.name, options))

@@ -16,7 +16,7 @@ import numpy as np
 import dualslam
 from dualslam.build import create_frontend
 from dualslam.core.config.settings import FrontendConfig
-from dualslam.places.cells import CELLS, N_CELLS
+from dualslam.places.faiss_index import CELLS, N_CELLS
 
 SOURCES = (
     *(f"synthetic:street,frames=240,seed={seed}" for seed in (90001, 90002)),

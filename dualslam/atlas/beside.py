@@ -10,36 +10,108 @@ or if a node is gone. It is also so if two nodes moved so far against each other
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 
 import numpy as np
 
-from dualslam.atlas.atlas import Atlas, Link
-from dualslam.atlas.edge_covariances import answer_edges, much_alike
+from dualslam.atlas.atlas import Atlas, Link, joined
+from dualslam.atlas.edge_covariances import Covariances, EdgeCovariances, answer_edges, much_alike
+from dualslam.atlas.node_views import NodeViews
 from dualslam.atlas.propagation import follow_keyframes
-from dualslam.atlas.skeleton import Skeleton
+from dualslam.atlas.record import Record
+from dualslam.atlas.skeleton import Skeleton, build_skeleton, foresee_skeleton, skeleton_knots
 from dualslam.core.atlas_problem import AtlasProblem, AtlasSolution, AtlasSolver
 from dualslam.core.errors import SolverError
 from dualslam.core.geometry import se3
-from dualslam.core.jobs import Handlers, JobKind
+from dualslam.core.jobs import Desk, Handlers, JobKind
 from dualslam.core.types import Failure, FailureReason, FloatArray
 from dualslam.map.submap import Submap
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class AtlasQuestion:
-    """The problems of linked sets that are to be solved: arrays, which nobody changes."""
+class AtlasProblems:
+    """Makes the problems of the linked sets that connections touch.
 
-    problems: tuple[AtlasProblem, ...]
+    `desk`: where covariances are computed that a problem to come will need.
+
+    Attributes
+    ----------
+    covariances : EdgeCovariances
+        What the submaps say of their own edges.
+    views : NodeViews
+        What their nodes see.
+    """
+
+    def __init__(self, record: Record, solver: AtlasSolver, desk: Desk) -> None:
+        self._record = record
+        self.covariances = EdgeCovariances(solver.edge_covariances, desk)
+        self.views = NodeViews()
+        self._newest: dict[int, int] = {}  # by submap: its newest keyframe at the last request
+
+    def foresee(self, touched: set[int], new: Sequence[Link]) -> None:
+        """Compute in the background what the solution with connections to come needs of the submaps."""
+        atlas = self._record.atlas
+        for component, links in self._touched(touched, new):
+            foresee_skeleton(atlas, component, links, self.covariances, self.views)
+        # What has come by the time that they are there goes with the keyframes that were asked about.
+        self._newest = {m: max(submap.keyframes) for m, submap in atlas.submaps.items()}
+
+    def foresee_rollover(self, submap_id: int) -> None:
+        """Ask a full submap for its covariances now: the first loop of a long run would wait for those of all."""
+        atlas = self._record.atlas
+        submap = atlas.submaps[submap_id]
+        pairs = list(pairwise(skeleton_knots(submap)))
+        self.covariances.foresee(submap, pairs, atlas.held.get(submap_id, frozenset()))
+
+    @property
+    def foreseeing(self) -> bool:
+        """Whether that is still being computed."""
+        return self.covariances.foreseeing
+
+    def now(self, touched: set[int], new: Sequence[Link]) -> list[Skeleton]:
+        """Make the problems of all linked sets that are touched, as the submaps are now.
+
+        Raises `SolverError` if a submap cannot tell its covariances.
+        """
+        self._newest = {}
+        return self._make(touched, new, self.covariances)
+
+    def foreseen(self, touched: set[int], new: Sequence[Link], again: bool) -> list[Skeleton]:
+        """Make them with what was prefetched; `again`: with covariances that hold for the current submaps.
+
+        Raises `SolverError`: as for `now`.
+        """
+        skeletons = self._make(touched, new, self.covariances if again else self.covariances.as_foreseen)
+        self._newest = {}
+        return skeletons
+
+    def _make(self, touched: set[int], new: Sequence[Link], covariances: Covariances) -> list[Skeleton]:
+        fresh = set(map(id, new))
+
+        def known(link: Link) -> bool:
+            return id(link) not in fresh and not link.rejected
+
+        return [
+            build_skeleton(self._record.atlas, component, links, covariances, self.views, known, newest=self._newest)
+            for component, links in self._touched(touched, new)
+        ]
+
+    def _touched(self, touched: set[int], new: Sequence[Link]) -> Iterator[tuple[list[int], list[Link]]]:
+        """Give the linked sets that new connections make of what they touch, each with its connections."""
+        atlas = self._record.atlas
+        links = [*atlas.links, *new]
+        for component in joined(atlas.submaps, links):
+            if touched & set(component):
+                yield component, [link for link in links if link.a in component]
 
 
 def answer_atlas(
-    question: AtlasQuestion, solve: Callable[[AtlasProblem], AtlasSolution]
+    problems: tuple[AtlasProblem, ...], solve: Callable[[AtlasProblem], AtlasSolution]
 ) -> tuple[AtlasSolution, ...] | Failure:
-    """Solve what a question asks for: a background job."""
+    """Solve the problems of linked sets, which nobody changes: a background job."""
     try:
-        return tuple(solve(problem) for problem in question.problems)
+        return tuple(solve(problem) for problem in problems)
     except SolverError as error:
         return Failure(FailureReason.SOLVER, str(error))
 
@@ -48,7 +120,7 @@ def atlas_handlers(solver: AtlasSolver) -> Handlers:
     """Return what solves the atlas, and gives the covariances that this needs."""
     return {
         JobKind.EDGES: lambda question: answer_edges(question, solver.edge_covariances),
-        JobKind.ATLAS: lambda question: answer_atlas(question, solver.solve),
+        JobKind.ATLAS: lambda problems: answer_atlas(problems, solver.solve),
     }
 
 
@@ -91,9 +163,10 @@ class AskedSolution:
             tries,
         )
 
-    def question(self) -> AtlasQuestion:
-        """Return the job."""
-        return AtlasQuestion(tuple(skeleton.problem for skeleton in self.skeletons))
+    @property
+    def problems(self) -> tuple[AtlasProblem, ...]:
+        """The job."""
+        return tuple(skeleton.problem for skeleton in self.skeletons)
 
     def take_in(self, row: int) -> None:
         """Note that the connection that waited has been taken into the atlas, as the last."""

@@ -12,9 +12,8 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 
 from dualslam.atlas.atlas import Atlas, Link, LinkKind
-from dualslam.atlas.beside import AskedSolution
+from dualslam.atlas.beside import AskedSolution, AtlasProblems
 from dualslam.atlas.moving import Mover
-from dualslam.atlas.problems import AtlasProblems
 from dualslam.atlas.propagation import propagate_anchors, propagate_links, propagate_poses
 from dualslam.atlas.record import FrameStamp, Record
 from dualslam.atlas.report import AtlasReport, Solved, tell, together
@@ -224,7 +223,7 @@ class Connections:
         except SolverError as error:
             return _failed(str(error))
         self._asked = AskedSolution.of(self._atlas, touched, skeletons, list(new), self._changes, tries)
-        self._desk.submit(JobKind.ATLAS, self._asked.question())
+        self._desk.submit(JobKind.ATLAS, self._asked.problems)
         for ended in self._desk.poll(JobKind.ATLAS):
             return self._take(ended.result, now, late=False)
         return None

@@ -1,18 +1,26 @@
-"""How submaps follow a solution of the atlas: all at once, or step by step between frames, the live one first."""
+"""How submaps follow a solution of the atlas: all at once, or step by step between frames, the live one first.
+
+A solution bends a submap: keyframes, landmarks, culled keyframes and frames follow one field.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from dualslam.atlas.bending import Move, bend_frames, bend_link, bend_submap, hold
+from dualslam.atlas.atlas import Link
 from dualslam.atlas.edge_covariances import EdgeCovariances
 from dualslam.atlas.record import Record
+from dualslam.atlas.trajectory import FramePose
+from dualslam.atlas.warp import Warp
 from dualslam.core.atlas_problem import AtlasSolver
+from dualslam.core.geometry import se3, sim3
 from dualslam.core.interfaces import SubmapGraph, VisualOdometry
-from dualslam.core.types import IntArray
+from dualslam.core.types import FloatArray, IntArray
+from dualslam.map.anchors import Anchor, RelativePose
+from dualslam.map.submap import Submap
 
 REFITTED = 2000
 """Landmarks that are found again under their new poses in one step: 10 to 20 ms, where a full submap has 9,000."""
@@ -117,3 +125,97 @@ class Mover:
     def _refit(self, submap_id: int, landmark_ids: IntArray) -> None:
         submap = self._record.atlas.submaps[submap_id]
         submap.landmarks["xyz_mu"][landmark_ids] = self._solver.refit_points(submap, landmark_ids)
+
+
+HOLD_RATIO = 1 / 3
+"""Sigma of a relative pose that holds a bend, over that of what the submap's own factors say there: nine tenths of the
+bend outlast a new solution of the submap."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Move:
+    """Effect of a solution on one submap."""
+
+    submap_id: int
+    warp: Warp  # acts from the left, in the submap's frame
+    S_world_submap: FloatArray  # (4, 4): where the solution puts the frame
+    bend_mu: float  # farthest that a keyframe goes
+    bent: bool  # whether any goes anywhere
+    steps: FloatArray
+    """(K - 1, 7, 7): covariances from knot to knot of the warp, as the submap's own factors give them: what is to hold
+    the bend."""
+
+
+def bend_submap(submap: Submap, warp: Warp) -> None:
+    """Move everything that a submap holds.
+
+    Each keyframe goes by the similarity at its frame; what that says about scale goes into the points around it, since
+    a pose has none. Landmarks go with the keyframe that described them first, so that what a keyframe sees of its own
+    keeps its pixels.
+    """
+    keyframe_ids, culled = list(submap.keyframes), list(submap.anchors)
+    T_culled = [submap.resolve_anchor(a.keyframe_id, a.T_kf_cam) for a in submap.anchors.values()]
+    S = warp.at(keyframe_ids)
+    scales = dict(zip(keyframe_ids, sim3.scale(S).tolist(), strict=True))
+    for k, T in zip(keyframe_ids, sim3.act_on_pose(S, submap.keyframe_poses(keyframe_ids)), strict=True):
+        submap.T_submap_kf[k] = T
+    if culled:
+        moved = sim3.act_on_pose(warp.at(culled), np.array(T_culled))
+        for k, T in zip(culled, moved, strict=True):
+            stays = submap.keyframe_for(k)
+            submap.anchors[k] = Anchor(stays, se3.inverse(submap.T_submap_kf[stays]) @ T)
+    for k, known in submap.relative_poses.items():
+        submap.relative_poses[k] = known.scaled(scales[k])
+    lm = submap.landmarks
+    if len(lm):
+        S_lm = warp.at(lm["first_kf"])
+        lm["xyz_mu"][:] = sim3.act_each(S_lm, lm["xyz_mu"])
+        lm["normal"][:] = np.einsum("nij,nj->ni", sim3.rotation(S_lm), lm["normal"])
+        lm["distance_mu"][:] *= sim3.scale(S_lm)
+
+
+def bend_frames(poses: Iterable[FramePose], before: Submap, after: Submap, warp: Warp) -> list[FramePose]:
+    """Return the frames of a bent submap where they are now, relative to the same keyframes, or to their heirs."""
+    own = [p for p in poses if p.submap_id == after.id and p.index not in after.keyframes]
+    if not own:
+        return []
+    T = np.array([before.resolve_anchor(p.keyframe_id, p.T_kf_cam) for p in own])
+    moved = sim3.act_on_pose(warp.at([p.index for p in own]), T)
+    stays = [after.keyframe_for(pose.keyframe_id) for pose in own]
+    T_kf_cam = se3.inverse(np.array([after.T_submap_kf[k] for k in stays])) @ moved
+    return [replace(pose, keyframe_id=k, T_kf_cam=T) for pose, k, T in zip(own, stays, T_kf_cam, strict=True)]
+
+
+def bend_link(link: Link, attached: tuple[int, int], warps: dict[int, Warp]) -> Link:
+    """Return a link as it is measured in submaps that have been bent: the same measurement, the same residual."""
+    k_a, k_b = attached
+    S_a_b, covariance = link.S_a_b, link.covariance
+    if link.a in warps:
+        S_a_b = warps[link.a].at([k_a])[0] @ S_a_b
+    if link.b in warps:
+        S = warps[link.b].at([k_b])[0]
+        Ad = sim3.adjoint(S)
+        S_a_b, covariance = S_a_b @ sim3.inverse(S), Ad @ covariance @ Ad.T
+    return replace(link, S_a_b=S_a_b, covariance=covariance)
+
+
+def hold(submap: Submap, knots: Sequence[int], covariances: FloatArray, held: frozenset[int]) -> frozenset[int]:
+    """Let relative poses from knot to knot hold a submap's shape; return the keyframes that have one.
+
+    A submap's own graph knows its projections only: solved again, it would straighten itself out. What another front
+    end said of a keyframe (a gap relocalisation) is not written over.
+
+    - `knots`: keyframes, ascending.
+    - `covariances` (K - 1, 7, 7): of the similarities between neighbours, as the submap's own factors give them.
+    - `held`: keyframes that hold an earlier bend so.
+    """
+    for k in held:
+        submap.relative_poses.pop(k, None)
+    now = set()
+    for first, second, C in zip(knots[:-1], knots[1:], covariances, strict=True):
+        if second in submap.relative_poses or not {first, second} <= submap.keyframes.keys():
+            continue
+        T = se3.inverse(submap.T_submap_kf[first]) @ submap.T_submap_kf[second]
+        submap.relative_poses[second] = RelativePose(first, T, HOLD_RATIO**2 * C[:6, :6])
+        now.add(second)
+    return frozenset(now)

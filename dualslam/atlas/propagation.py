@@ -8,7 +8,9 @@ from dataclasses import replace
 import numpy as np
 
 from dualslam.atlas.atlas import Atlas, Link
+from dualslam.atlas.record import Record
 from dualslam.atlas.trajectory import FramePose
+from dualslam.core.bundle import FrameRows
 from dualslam.core.geometry import se3, sim3
 from dualslam.core.types import FloatArray, IntArray
 from dualslam.map.anchors import Anchor
@@ -65,10 +67,7 @@ def _propagate(
 
 
 def follow_keyframes(
-    S_a_b: FloatArray,
-    covariance: FloatArray,
-    then: tuple[FloatArray, FloatArray],
-    now: tuple[FloatArray, FloatArray],
+    S_a_b: FloatArray, covariance: FloatArray, then: tuple[FloatArray, FloatArray], now: tuple[FloatArray, FloatArray]
 ) -> tuple[FloatArray, FloatArray]:
     """Return a similarity between two submaps, and its covariance, as a keyframe of each has moved.
 
@@ -102,3 +101,56 @@ def _change_at(before: Submap, after: Submap, link: Link, attached: int) -> Floa
     """Return how a submap has changed about the keyframes that a link stands on there."""
     stands_on = [k for k in (*link.keyframes, attached) if k in before.keyframes and k in after.keyframes]
     return change_of_frame(before, after, stands_on or before.keyframes)
+
+
+def rows_of_frames(record: Record, submap: Submap, at_most: int, min_inliers: int) -> FrameRows:
+    """Return what the frames of a submap that are no keyframes of it have seen.
+
+    - `at_most`: so many frames, spread evenly over those that are kept.
+    - `min_inliers`: frames that have seen fewer of its landmarks are left out.
+    """
+    own = np.array(sorted(_frames_of(record, submap)), np.int64)
+    chosen = own[np.linspace(0, len(own) - 1, min(at_most, len(own))).round().astype(np.int64)]
+    rows = [(record.poses[i], *record.observations[i].seen_now(submap)) for i in chosen.tolist()]
+    rows = [row for row in rows if len(row[1]) >= min_inliers]
+    n_seen = np.array([len(ids) for _, ids, _, _ in rows], np.int64)
+    return FrameRows(
+        np.array([submap.resolve_anchor(p.keyframe_id, p.T_kf_cam) for p, *_ in rows]).reshape(-1, 4, 4),
+        np.repeat(np.arange(len(rows)), n_seen),
+        np.concatenate([np.zeros(0, np.int64), *(ids for _, ids, _, _ in rows)]),
+        np.concatenate([np.zeros((0, 2)), *(uv_px for _, _, uv_px, _ in rows)]),
+        np.concatenate([np.zeros(0), *(sigma_px for _, _, _, sigma_px in rows)]),
+    )
+
+
+def pose_frames_anew(record: Record, submap: Submap, shape: float, min_inliers: int) -> int:
+    """Pose the frames of a submap that are no keyframes of it by its landmarks; return how many were.
+
+    A frame was tracked by landmarks as they were then; young ones may have been far off, and keyframes were mended with
+    them (docs/notes/2026-11-27-frames-posed-anew-at-the-end.md).
+
+    - `submap`: as it stays.
+    - `shape`: of the loss under which it was refined, in the pixels' sigmas.
+    - `min_inliers`: a frame of which fewer landmarks agree stays where it is.
+    """
+    n_posed = 0
+    for i in _frames_of(record, submap):
+        pose = record.poses[i]
+        T_submap_cam = submap.resolve_anchor(pose.keyframe_id, pose.T_kf_cam)
+        T_submap_cam_now = record.observations[i].pose(submap, T_submap_cam, shape, min_inliers)
+        if T_submap_cam_now is not None:
+            k = submap.keyframe_for(pose.keyframe_id)
+            T_kf_cam = se3.inverse(submap.T_submap_kf[k]) @ T_submap_cam_now
+            record.poses[i] = replace(pose, keyframe_id=k, T_kf_cam=T_kf_cam)
+            n_posed += 1
+    return n_posed
+
+
+def _frames_of(record: Record, submap: Submap) -> list[int]:
+    """Return the frames that are posed in a submap, have kept what they saw of it, and are no keyframes."""
+    return [
+        i
+        for i, seen in record.observations.items()
+        if seen.submap_id == submap.id and i in record.poses and i not in submap.keyframes
+        if record.poses[i].submap_id == submap.id
+    ]

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import chain, compress, repeat
 
 import numpy as np
 
 from dualslam.atlas.atlas import Link
-from dualslam.atlas.bending import Move
+from dualslam.atlas.moving import Move
 from dualslam.atlas.record import FrameStamp, Record
 from dualslam.atlas.skeleton import WITHIN, Skeleton
 from dualslam.atlas.warp import Warp
@@ -99,7 +99,7 @@ class Solved:
             rejected=tuple(link for link in links if link.rejected and link.a in self.skeleton.component),
             newly_rejected=tuple(links[i] for i in newly_rejected),
             readmitted=tuple(links[i] for i in readmitted),
-            factors=count_kinds(self.kinds),
+            factors=dict(Counter(self.kinds)),
             cost_before=self.solution.cost_before,
             cost_after=self.solution.cost_after,
             drift=self.solution.drift,
@@ -144,15 +144,14 @@ def placed_by(skeleton: Skeleton, solution: AtlasSolution) -> dict[int, float]:
 
 def together(reports: Sequence[AtlasReport]) -> AtlasReport:
     """Return one report of several linked sets."""
-    factors: dict[str, int] = {}
+    factors = Counter[str]()
     for report in reports:
-        for kind, n in report.factors.items():
-            factors[kind] = factors.get(kind, 0) + n
+        factors.update(report.factors)
     return AtlasReport(
         rejected=tuple(link for r in reports for link in r.rejected),
         newly_rejected=tuple(link for r in reports for link in r.newly_rejected),
         readmitted=tuple(link for r in reports for link in r.readmitted),
-        factors=factors,
+        factors=dict(factors),
         cost_before=sum(r.cost_before for r in reports),
         cost_after=sum(r.cost_after for r in reports),
         drift=max((r.drift for r in reports), default=1.0),
@@ -160,11 +159,6 @@ def together(reports: Sequence[AtlasReport]) -> AtlasReport:
         bent={m: bend for r in reports for m, bend in r.bent.items()},
         placed={m: gone for r in reports for m, gone in r.placed.items()},
     )
-
-
-def count_kinds(kinds: Iterable[str]) -> dict[str, int]:
-    """Return how many edges there are of each kind, in the order of their first."""
-    return dict(Counter(kinds))
 
 
 def named(link: Link) -> dict[str, object]:

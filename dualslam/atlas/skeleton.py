@@ -154,16 +154,13 @@ def skeleton_knots(submap: Submap, wanted: Set[int] = frozenset(), newest: int |
     return sorted({*ids[::STRIDE], ids[-1], _reference(submap), *wanted})
 
 
-def _nearest(knots: list[int], k: int) -> int:
-    return min(knots, key=lambda knot: (abs(knot - k), knot))
-
-
 def _reference(submap: Submap) -> int:
     """Return the keyframe that a submap's frame goes by: the first of its gauge."""
-    k = submap.gauge[0]
-    while k not in submap.keyframes and k in submap.anchors:
-        k = submap.anchors[k].keyframe_id
-    return k if k in submap.keyframes else min(submap.keyframes)
+    return submap.living_keyframe(submap.gauge[0])
+
+
+def _nearest(knots: list[int], k: int) -> int:
+    return min(knots, key=lambda knot: (abs(knot - k), knot))
 
 
 def _within(
@@ -210,15 +207,9 @@ def _edges_within(i: IntArray, j: IntArray, S: FloatArray, C: FloatArray) -> Atl
 
 
 def _joined_edges(a: AtlasEdges, b: AtlasEdges) -> AtlasEdges:
-    return AtlasEdges(
-        np.concatenate([a.first, b.first]),
-        np.concatenate([a.second, b.second]),
-        np.concatenate([a.S_first_second, b.S_first_second]),
-        np.concatenate([a.covariance, b.covariance]),
-        a.kind + b.kind,
-        np.concatenate([a.doubtful, b.doubtful]),
-        np.concatenate([a.known, b.known]),
-    )
+    names = ("first", "second", "S_first_second", "covariance", "doubtful", "known")
+    columns = {name: np.concatenate([getattr(a, name), getattr(b, name)]) for name in names}
+    return AtlasEdges(kind=a.kind + b.kind, **columns)
 
 
 def _are_torn(own: FloatArray, now: FloatArray, covariances: FloatArray) -> BoolArray:

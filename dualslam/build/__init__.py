@@ -8,7 +8,7 @@ from dualslam.build.checks import check_config, fault_of_frontend
 from dualslam.build.parts import adjust_submap, find_focal, find_frontend, new_initialiser, window_solver
 from dualslam.build.system import LiveParts, build_system
 from dualslam.build.walks import recovery_parts
-from dualslam.build.workers import feature_handlers, graph_handlers, walk_handlers
+from dualslam.build.workers import feature_handlers, walk_handlers
 from dualslam.frontends.registry import create_frontend
 
 __all__ = [
@@ -21,7 +21,6 @@ __all__ = [
     "feature_handlers",
     "find_focal",
     "find_frontend",
-    "graph_handlers",
     "new_initialiser",
     "recovery_parts",
     "walk_handlers",

@@ -20,8 +20,8 @@ from dualslam.core.estimates import FrontendChoice
 from dualslam.core.interfaces import Frontend, SelfCalibrator, WindowSolver
 from dualslam.core.metric_problem import MeasurementSource, MetricProblem, MetricSolution, RowSource
 from dualslam.core.types import Failure, FloatArray, Frame
-from dualslam.frontends.asking import features_of
 from dualslam.frontends.choice import Candidate, choose_frontend
+from dualslam.frontends.features.images import features_of
 from dualslam.frontends.frame_reader import view_of
 from dualslam.frontends.place_matcher import FrontendPlaceMatcher
 from dualslam.frontends.registry import create_frontend

@@ -10,14 +10,7 @@ from functools import partial
 from dualslam.atlas.tidying import tidy
 from dualslam.backend.final_refinement import refine_submap
 from dualslam.build.checks import check_config, check_given
-from dualslam.build.parts import (
-    atlas_solver,
-    graph_maker,
-    new_calibration,
-    new_initialiser,
-    place_parts,
-    window_solver,
-)
+from dualslam.build.parts import atlas_solver, graph_maker, new_calibration, new_initialiser, place_parts, window_solver
 from dualslam.build.walks import recovery_parts
 from dualslam.build.workers import (
     MAP_KINDS,
@@ -54,7 +47,7 @@ from dualslam.map.graph_beside import BesideGraphs
 from dualslam.map.lens import Calibration
 from dualslam.map.solving import open_graph
 from dualslam.map.submap import Submap
-from dualslam.system.components import Components
+from dualslam.system.state import Components
 from dualslam.system.system import System
 from dualslam.workers.desk import WorkerDesk
 from dualslam.workers.scheduled_desk import ScheduledDesk

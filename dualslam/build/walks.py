@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from functools import cached_property, partial
+from functools import cached_property
 
 from dualslam.backend.self_calibration import find_preferred_camera
 from dualslam.build.checks import auxiliary_config, naming_attempt
@@ -17,17 +17,15 @@ from dualslam.core.interfaces import Frontend, SubmapGraph
 from dualslam.core.types import Failure, FailureReason, Frame, IntArray, LateFrame, View
 from dualslam.frontends.features.image_features import ImageFeatures
 from dualslam.frontends.frame_reader import view_of
-from dualslam.frontends.gap.auxiliary_features import Auxiliary, BufferedFeatures, OwnFeatures
-from dualslam.frontends.gap.pnp_odometry import PnpOdometry
+from dualslam.frontends.gap.auxiliary_map import Auxiliary, BufferedFeatures, OwnFeatures
+from dualslam.frontends.gap.pnp_odometry import PnpOdometry, Route, find_lack
 from dualslam.frontends.gap.refinding import Refinder
-from dualslam.frontends.gap.route import Route, find_lack
 from dualslam.frontends.registry import FOR_WALKS, create_frontend, find_missing
 from dualslam.frontends.tracking.visual import VisualFrontEnd
 from dualslam.linking import DescriptorMatcher
 from dualslam.linking.gates import DESCRIPTOR_RADIUS_PX
 from dualslam.map.submap import Submap
-from dualslam.recovery.attempts import Attempt, RecoveryParts
-from dualslam.recovery.job import RecoveryJob
+from dualslam.recovery.job import Attempt, RecoveryJob, RecoveryParts
 
 MAX_UNRECOGNISED = 5
 """An attempt by other features alone, after another one, ends at so many frames in a row that show something and are
@@ -140,51 +138,32 @@ def _attempts(
     camera: Camera,
     auxiliaries: dict[str, _ImagesOf],
 ) -> tuple[Attempt, ...]:
-    """Build the attempts."""
+    """Build the attempts: front ends, of which the live one may be one, give the live one its poses."""
     own = Auxiliary(frontend, OwnFeatures())
-    attempts = []
-    for number, attempt in enumerate(config.recovery.attempts):
-        if attempt.is_live:
-            attempts.append(_attempt_by(lambda camera: (own,), attempt, config, live, camera))
-            continue
-        others = auxiliaries[auxiliary_config(attempt).model_dump_json()]
-        first = (own,) if attempt.tracking == "live" else ()
-        made = _attempt_by(partial(_after, first, others, config.camera.model_sigma_px), attempt, config, live, camera)
-        made = replace(made, find_lack=others.find_lack) if attempt.if_installed else made
-        attempts.append(made if number == 0 or first else replace(made, max_unrecognised=MAX_UNRECOGNISED))
-    return tuple(attempts)
 
+    def build(number: int, attempt: AttemptConfig) -> Attempt:
+        tracks_live = attempt.is_live or attempt.tracking == "live"
+        others = None if attempt.is_live else auxiliaries[auxiliary_config(attempt).model_dump_json()]
 
-def _after(
-    first: tuple[Auxiliary, ...], others: _ImagesOf, model_sigma_px: float, camera: Camera
-) -> tuple[Auxiliary, ...]:
-    images = others.images
-    return (*first, Auxiliary(images.frontend, BufferedFeatures(images, model_sigma_px, camera)))
+        def new_odometry(job: RecoveryJob, submap: Submap, graph: SubmapGraph) -> PnpOdometry:
+            asked = [own] if tracks_live else []
+            if others is not None:
+                buffered = BufferedFeatures(others.images, config.camera.model_sigma_px, job.camera)
+                asked.append(Auxiliary(others.images.frontend, buffered))
+            return PnpOdometry(
+                live(job, submap, graph),
+                asked,
+                Route(job.own, job.views),
+                bundle_adjuster(config),
+                config,
+                camera,
+                tracks_live,
+                notes_rivals=job.notes_rivals,
+                expected=job.expected,
+            )
 
+        max_unrecognised = None if number == 0 or tracks_live else MAX_UNRECOGNISED
+        made = Attempt(attempt.name, new_odometry, max_unrecognised=max_unrecognised)
+        return made if others is None or not attempt.if_installed else replace(made, find_lack=others.find_lack)
 
-def _attempt_by(
-    auxiliaries: Callable[[Camera], tuple[Auxiliary, ...]],
-    attempt: AttemptConfig,
-    config: Config,
-    live: Callable[[RecoveryJob, Submap, SubmapGraph], VisualFrontEnd],
-    camera: Camera,
-) -> Attempt:
-    """Build an attempt in which front ends, of which the live one may be one, give the live one its poses."""
-    tracks_live = attempt.is_live or attempt.tracking == "live"
-
-    def new_odometry(job: RecoveryJob, submap: Submap, graph: SubmapGraph) -> PnpOdometry:
-        reverse_tracker, route = live(job, submap, graph), Route(job.own, job.views)
-        adjuster = bundle_adjuster(config)
-        return PnpOdometry(
-            reverse_tracker,
-            auxiliaries(job.camera),
-            route,
-            adjuster,
-            config,
-            camera,
-            tracks_live,
-            notes_rivals=job.notes_rivals,
-            expected=job.expected,
-        )
-
-    return Attempt(attempt.name, new_odometry)
+    return tuple(build(number, attempt) for number, attempt in enumerate(config.recovery.attempts))

@@ -21,13 +21,12 @@ from dualslam.lab.disturbances import FaultScript
 from dualslam.map.graph_beside import GraphServer
 from dualslam.map.lens import CalibrationAnswer, CalibrationJob, answer
 from dualslam.places import PlaceVerifier
-from dualslam.places.search import search_places
-from dualslam.recovery.attempts import RecoveryParts
+from dualslam.places.recogniser import search_places
+from dualslam.recovery.job import RecoveryParts
 from dualslam.recovery.reverse_tracking import recover_in_steps
 from dualslam.recovery.scale_watch import SCALE_HANDLERS
 from dualslam.workers.desk import Lane, WorkerDesk
-from dualslam.workers.features_beside import FeaturesBeside
-from dualslam.workers.start_beside import StartServer
+from dualslam.workers.start_beside import FeaturesBeside, StartServer
 
 WORKER_BUDGET = 0.75
 """Share of the time after which a worker counts as hung that its walks may take: what they have by then is not lost."""
@@ -44,41 +43,22 @@ GRAPH_NICENESS, WALK_NICENESS = 3, 8
 where cores are short."""
 
 
-def calibration_handlers(config: Config, new_graph: Callable[[], SubmapGraph]) -> Handlers:
-    """Build what answers questions about the camera."""
+def inline_handlers(
+    config: Config, parts: RecoveryParts, verifier: PlaceVerifier, new_graph: Callable[[], SubmapGraph]
+) -> dict[JobKind, Handler]:
+    """Build what does the long work: reverse tracking, questions about the camera, the search for places, the atlas."""
 
     def answered(job: CalibrationJob) -> CalibrationAnswer | Failure:
         return answer(job, new_calibration(config, job.camera, job.covariance), new_graph)
 
-    return {JobKind.CALIBRATION: answered}
-
-
-def place_handlers(verifier: PlaceVerifier) -> Handlers:
-    """Build what verifies places."""
-    return {JobKind.LOOP: lambda search: search_places(search, verifier)}
-
-
-READOUT_HANDLERS: Handlers = {JobKind.READOUT: answer_readout}
-"""Jobs that estimate the readout time."""
-
-
-def inline_handlers(
-    config: Config, parts: RecoveryParts, verifier: PlaceVerifier, new_graph: Callable[[], SubmapGraph]
-) -> dict[JobKind, Handler]:
-    """Build what does the long work in this process."""
     return {
         JobKind.WALK: lambda job: recover_in_steps(job, parts),
+        JobKind.READOUT: answer_readout,
+        JobKind.CALIBRATION: answered,
+        JobKind.LOOP: lambda search: search_places(search, verifier),
         **atlas_handlers(atlas_solver(config)),
         **SCALE_HANDLERS,
-        **READOUT_HANDLERS,
-        **calibration_handlers(config, new_graph),
-        **place_handlers(verifier),
     }
-
-
-def graph_handlers(config: Config) -> Handlers:
-    """Build what keeps and solves the graphs of submaps."""
-    return {JobKind.GRAPH: GraphServer(graph_maker(config))}
 
 
 def map_handlers(config: Config, size_px: tuple[int, int]) -> dict[JobKind, Handler]:
@@ -86,24 +66,16 @@ def map_handlers(config: Config, size_px: tuple[int, int]) -> dict[JobKind, Hand
     frontend = create_frontend(config.frontend)
     return {
         JobKind.START: StartServer(partial(new_initialiser, config, frontend, size_px)),
-        **graph_handlers(config),
+        JobKind.GRAPH: GraphServer(graph_maker(config)),
     }
 
 
 def walk_handlers(config: Config, camera: Camera, n_threads: int) -> Handlers:
-    """Build what a worker for long work does: reverse tracking, calibrations, the search for places, the atlas."""
+    """Build what a worker for long work does."""
     frontend = create_frontend(config.frontend)
     parts = recovery_parts(config, camera, frontend, n_threads)
     verifier = place_parts(config, frontend, camera).verifier
-    return {
-        JobKind.WALK: lambda job: recover_in_steps(job, parts),
-        JobKind.FORESIGHT: parts.foresee,
-        **atlas_handlers(atlas_solver(config)),
-        **SCALE_HANDLERS,
-        **READOUT_HANDLERS,
-        **calibration_handlers(config, graph_maker(config)),
-        **place_handlers(verifier),
-    }
+    return {JobKind.FORESIGHT: parts.foresee, **inline_handlers(config, parts, verifier, graph_maker(config))}
 
 
 def feature_handlers(config: FrontendConfig) -> Handlers:
@@ -134,12 +106,7 @@ def worker_desk(config: Config, camera: Camera, faults: FaultScript, watch: Walk
         niceness=WALK_NICENESS,
     )
     live_map = Lane(
-        "map",
-        MAP_KINDS,
-        partial(map_handlers, config, camera.size_px),
-        1,
-        GRAPH_LIMIT_S,
-        niceness=GRAPH_NICENESS,
+        "map", MAP_KINDS, partial(map_handlers, config, camera.size_px), 1, GRAPH_LIMIT_S, niceness=GRAPH_NICENESS
     )
     return WorkerDesk([live_map, walks], recovery.finish_wait_s, faults.kill_worker, watch)
 

@@ -24,10 +24,9 @@ from dualslam.core.estimates import GraphEstimate
 from dualslam.core.interfaces import N_WINDOW, SubmapGraph, WindowSolver
 from dualslam.core.jobs import Desk, JobKind
 from dualslam.core.types import Failure, FailureReason, FloatArray, IntArray
-from dualslam.map.dead_rows import drop_dead_rows
 from dualslam.map.late_estimate import apply_late
 from dualslam.map.submap import Submap
-from dualslam.map.submap_delta import SubmapDelta, SubmapMirror
+from dualslam.map.submap_delta import SubmapDelta, SubmapMirror, drop_dead_rows
 
 log = logging.getLogger(__name__)
 
@@ -45,13 +44,6 @@ class GraphJob:
     near_optimum: bool  # see `SubmapGraph.rebuild`
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class GraphAnswer:
-    """State of a graph after a job."""
-
-    estimate: GraphEstimate  # of everything in it
-
-
 class GraphServer:
     """Keeps graphs and the replicas of their submaps, in the process that solves them."""
 
@@ -63,8 +55,11 @@ class GraphServer:
         """Forget all graphs, as if the process had been started anew."""
         self._graphs = {}
 
-    def __call__(self, job: GraphJob) -> GraphAnswer | Failure:
-        """Do a job; a failure forgets the graph, and the next job must bring the whole submap."""
+    def __call__(self, job: GraphJob) -> GraphEstimate | Failure:
+        """Do a job, and return the estimate of all that is in the graph.
+
+        A failure forgets the graph, and the next job must bring the whole submap.
+        """
         known = self._graphs.pop(job.graph_id, None)
         if known is None and not job.delta.is_whole:
             return Failure(FailureReason.DISABLED, f"graph {job.graph_id} is not known here")
@@ -83,8 +78,8 @@ class GraphServer:
             del self._graphs[next(iter(self._graphs))]
         outliers = np.union1d(solved.outlier_rows, whole.outlier_rows)
         ids, T, landmarks, xyz = whole.values
-        return GraphAnswer(
-            replace(solved, keyframe_ids=ids, T_submap_kf=T, landmark_ids=landmarks, xyz_mu=xyz, outlier_rows=outliers)
+        return replace(
+            solved, keyframe_ids=ids, T_submap_kf=T, landmark_ids=landmarks, xyz_mu=xyz, outlier_rows=outliers
         )
 
 
@@ -292,7 +287,7 @@ class BesideGraphs:
         self._under_way = submap.id, graph, submap.K
         self._desk.submit(JobKind.GRAPH, GraphJob(graph.id, graph.mirror.delta(submap), near is not None, bool(near)))
 
-    def _take(self, result: GraphAnswer | Failure, submaps: Mapping[int, Submap]) -> Moved | None:
+    def _take(self, result: GraphEstimate | Failure, submaps: Mapping[int, Submap]) -> Moved | None:
         assert self._under_way is not None
         submap_id, graph, K = self._under_way
         if isinstance(result, Failure):
@@ -304,17 +299,17 @@ class BesideGraphs:
         self._under_way = None
         if self._graphs.get(submap_id) is not graph or graph.rebuild_asked is not None:
             return None  # the submap has another graph by now, or is to be made anew from what it has become
-        submap, estimate = submaps[submap_id], result.estimate
+        submap = submaps[submap_id]
         if (submap.K != K).any():  # its camera was changed meanwhile, with one that it is to be linked with
             graph.is_behind = True
             return None
-        graph.noise2 = estimate.noise2
-        self._answered[submap_id] = frozenset(estimate.keyframe_ids.tolist())
-        before = apply_late(submap, *estimate.values)
-        rows = estimate.outlier_rows[submap.observations["alive"][estimate.outlier_rows]]
+        graph.noise2 = result.noise2
+        self._answered[submap_id] = frozenset(result.keyframe_ids.tolist())
+        before = apply_late(submap, *result.values)
+        rows = result.outlier_rows[submap.observations["alive"][result.outlier_rows]]
         submap.remove_outliers(rows)
         graph.holds_refused = len(rows) > 0
-        return Moved(submap, before, estimate.rebuilt)
+        return Moved(submap, before, result.rebuilt)
 
     def _forget(self) -> None:
         """Give up what is under way: the process has that graph no more, and the next job makes it anew."""

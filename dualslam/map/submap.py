@@ -124,6 +124,12 @@ class Submap:
             keyframe_id = self.anchors[keyframe_id].keyframe_id
         return keyframe_id
 
+    def living_keyframe(self, keyframe_id: int) -> int:
+        """Return a keyframe, the one that stands for it since it was culled, or the first where neither is known."""
+        while keyframe_id not in self.keyframes and keyframe_id in self.anchors:
+            keyframe_id = self.anchors[keyframe_id].keyframe_id
+        return keyframe_id if keyframe_id in self.keyframes else min(self.keyframes)
+
     def resolve_anchor(self, keyframe_id: int, T_kf_cam: FloatArray) -> FloatArray:
         """Return ``T_submap_cam`` of a frame posed relative to a keyframe, also if that keyframe was culled since."""
         while keyframe_id not in self.T_submap_kf:

@@ -8,16 +8,8 @@ In reading order:
 """
 
 from dualslam.places.faiss_index import FaissRecogniser
-from dualslam.places.recogniser import PlaceCandidate, PlaceRecogniser
-from dualslam.places.second_pose import SecondSimilarity, find_second_pose
+from dualslam.places.recogniser import PlaceCandidate
+from dualslam.places.sides import SecondSimilarity, find_second_pose
 from dualslam.places.verification import PlaceMatch, PlaceVerifier
 
-__all__ = [
-    "FaissRecogniser",
-    "PlaceCandidate",
-    "PlaceMatch",
-    "PlaceRecogniser",
-    "PlaceVerifier",
-    "SecondSimilarity",
-    "find_second_pose",
-]
+__all__ = ["FaissRecogniser", "PlaceCandidate", "PlaceMatch", "PlaceVerifier", "SecondSimilarity", "find_second_pose"]

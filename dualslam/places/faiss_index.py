@@ -7,6 +7,8 @@ inverted file over fixed cells makes the search as quick (5 to 12 ms among 60,00
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from functools import cache
+from pathlib import Path
 from typing import Any
 
 import faiss
@@ -15,8 +17,19 @@ from numpy.typing import NDArray
 
 from dualslam.core.types import Features, FloatArray, IntArray
 from dualslam.map.submap import Submap
-from dualslam.places.cells import shipped_cells
 from dualslam.places.recogniser import PlaceCandidate
+
+CELLS = Path(__file__).with_name("cells.npy")
+N_CELLS = 1024
+
+
+@cache
+def shipped_cells() -> NDArray[np.uint8]:
+    """Return the centres (1024, 32) of the cells, of ORB descriptors of rendered worlds."""
+    cells: NDArray[np.uint8] = np.load(CELLS, allow_pickle=False)
+    cells.setflags(write=False)
+    return cells
+
 
 N_PROBED = 8
 """Cells that are searched for a descriptor: between the 4 and 16 that were measured (recall 0.91 and 0.97)."""
@@ -30,7 +43,10 @@ SAME_PLACE = 0.3
 
 
 class FaissRecogniser:
-    """An index over the landmarks of all submaps.
+    """Remembers the landmarks of all submaps by their descriptors, and says which keyframes an image resembles.
+
+    It proposes and proves nothing: what it finds goes through `dualslam.places.verification`. The same calls in the
+    same order give the same candidates.
 
     Descriptors of 256 bits go into the cells that are shipped. Others, and vectors of numbers, are searched
     exhaustively.
@@ -65,7 +81,11 @@ class FaissRecogniser:
         return 0 if self._index is None else int(self._index.ntotal)
 
     def take_in(self, submap: Submap, n_newest_left_out: int = 0, at_most: int | None = None) -> int:
-        """Add the landmarks that a submap has gained since the last call, the oldest `at_most` of them."""
+        """Add the landmarks that a submap has gained since the last call; return how many.
+
+        `n_newest_left_out`: keyframes, by insertion, whose own new landmarks have yet to prove themselves. `at_most`:
+        the oldest so many of them; the others are left to later calls.
+        """
         start, stop = self._n_taken.get(submap.id, 0), len(submap.landmarks)
         if n_newest_left_out:
             young = np.isin(submap.landmarks["first_kf"][start:], list(submap.keyframes)[-n_newest_left_out:])
@@ -91,7 +111,12 @@ class FaissRecogniser:
         may_be: Callable[[int, int], bool] = lambda submap_id, keyframe_id: True,
         at_most: int = 3,
     ) -> list[PlaceCandidate]:
-        """Return the keyframes that an image resembles most, best first, each of another place."""
+        """Return the keyframes that an image resembles most, best first, each of another place.
+
+        - `features`: of the image.
+        - `submaps`: the current submaps of the index: culled and merged landmarks are followed there.
+        - `may_be`: whether a keyframe (submap id, keyframe id) may be returned; called for keyframes with votes only.
+        """
         if not len(self) or not len(features):
             return []
         feature, row = self._nearest(np.ascontiguousarray(features.descriptors))

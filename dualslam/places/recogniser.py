@@ -1,13 +1,20 @@
-"""Interface of place recognition."""
+"""The search for a revisited place as a background job.
+
+Asking the index is cheap and stays where the map grows. Verification takes as long as several frames: a snapshot goes
+to a worker, and verified places come back.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from typing import Protocol
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 
-from dualslam.core.types import Features
+import numpy as np
+
+from dualslam.atlas.propagation import follow_keyframes
+from dualslam.core.types import Failure, FloatArray
 from dualslam.map.submap import Submap
+from dualslam.places.verification import PlaceMatch, PlaceVerifier
 
 
 @dataclass(frozen=True, slots=True)
@@ -19,37 +26,44 @@ class PlaceCandidate:
     n_votes: int  # features of the image of which a landmark that the keyframe sees is among the nearest
 
 
-class PlaceRecogniser(Protocol):
-    """Remembers landmarks by their descriptors, and says which keyframes an image resembles.
+@dataclass(frozen=True, slots=True, eq=False)
+class PlaceSearch:
+    """A keyframe, and the places that it may show."""
 
-    It proposes and proves nothing: what it finds goes through `dualslam.places.verification`. The same calls in the
-    same order give the same candidates.
+    # Of the keyframe that asks.
+    submap_id: int
+    keyframe_id: int
+    candidates: tuple[PlaceCandidate, ...]  # the most likely first
+    submaps: Mapping[int, Submap]  # snapshots of those that are named
+
+
+def search_places(search: PlaceSearch, verifier: PlaceVerifier) -> list[PlaceMatch | Failure]:
+    """Verify the candidates of a search; the result is in their order."""
+    submaps, query = search.submaps, (search.submap_id, search.keyframe_id)
+    return [
+        verifier.verify((submaps[query[0]], query[1]), (submaps[c.submap_id], c.keyframe_id)) for c in search.candidates
+    ]
+
+
+def poses_of(match: PlaceMatch, submaps: Mapping[int, Submap]) -> tuple[FloatArray, FloatArray] | None:
+    """Return the poses (4, 4) of a match's two keyframes in their submaps; None where one of them is no more."""
+    (a, k_a), (b, k_b) = match.place, match.query
+    if a not in submaps or k_a not in submaps[a].keyframes or b not in submaps or k_b not in submaps[b].keyframes:
+        return None
+    return submaps[a].T_submap_kf[k_a], submaps[b].T_submap_kf[k_b]
+
+
+def follow_maps(
+    match: PlaceMatch, then: tuple[FloatArray, FloatArray], submaps: Mapping[int, Submap]
+) -> PlaceMatch | None:
+    """Return a match between the current submaps, which have been solved again since it was made.
+
+    None where one of its keyframes is no more. `then`: their poses when the match was made.
     """
-
-    @property
-    def nbytes(self) -> int:
-        """Memory of the index, about."""
-        ...
-
-    def take_in(self, submap: Submap, n_newest_left_out: int = 0, at_most: int | None = None) -> int:
-        """Add the landmarks that a submap has gained since the last call; return how many.
-
-        `n_newest_left_out`: keyframes, by insertion, whose own new landmarks have yet to prove themselves. `at_most`:
-        the oldest so many of them; the others are left to later calls.
-        """
-        ...
-
-    def query(
-        self,
-        features: Features,
-        submaps: Mapping[int, Submap],
-        may_be: Callable[[int, int], bool] = lambda submap_id, keyframe_id: True,
-        at_most: int = 3,
-    ) -> list[PlaceCandidate]:
-        """Return the keyframes that an image resembles most, best first, each of another place.
-
-        - `features`: of the image.
-        - `submaps`: the current submaps of the index: culled and merged landmarks are followed there.
-        - `may_be`: whether a keyframe (submap id, keyframe id) may be returned; called for keyframes with votes only.
-        """
-        ...
+    now = poses_of(match, submaps)
+    if now is None:
+        return None
+    if all(np.array_equal(a, b) for a, b in zip(now, then, strict=True)):
+        return match
+    S, covariance = follow_keyframes(match.S_place_query, match.covariance, then, now)
+    return replace(match, S_place_query=S, covariance=covariance)

@@ -21,7 +21,7 @@ from dualslam.core.jobs import Desk, Ended, JobKind
 from dualslam.core.types import Failure, FailureReason, FloatArray
 from dualslam.map.submap import Submap
 from dualslam.places.plausibility import agree, contradict, plausible
-from dualslam.places.search import PlaceSearch, follow_maps, poses_of
+from dualslam.places.recogniser import PlaceSearch, follow_maps, poses_of
 from dualslam.places.sightings import N_CONFIRMING, PlaceParts, Sightings, record_refusal
 from dualslam.places.verification import PlaceMatch
 
@@ -39,34 +39,15 @@ _SILENT = (FailureReason.TOO_FEW_MATCHES, FailureReason.TOO_FEW_INLIERS)
 """Refusals of what only looked alike to the recogniser: they are no events."""
 
 
-@dataclass(slots=True)
-class _Provisional:
-    """A verified pair that waits for others to say the same."""
+@dataclass(slots=True, eq=False)
+class _Found:
+    """A verified place: provisional until others say the same, then believed, then solved with."""
 
     match: PlaceMatch
     confirmations: int = 0
     misses: int = 0
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Believed:
-    """A place that enough keyframes have confirmed, and where its two keyframes stood then.
-
-    It waits for what the atlas needs to be solved with it.
-    """
-
-    match: PlaceMatch
-    confirmations: int
-    then: tuple[FloatArray, FloatArray]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Closing:
-    """A place whose connection the atlas is being solved with."""
-
-    match: PlaceMatch
-    confirmations: int
-    kind: LinkKind
+    then: tuple[FloatArray, FloatArray] | None = None  # where its two keyframes stood when it was believed
+    kind: LinkKind | None = None  # of the connection that the atlas is solved with
 
 
 class Revisits:
@@ -96,9 +77,9 @@ class Revisits:
         self._connections = connections
         self._desk = desk
         self._config = config
-        self._provisional: _Provisional | None = None
-        self._believed: _Believed | None = None
-        self._closing: _Closing | None = None
+        self._provisional: _Found | None = None
+        self._believed: _Found | None = None  # waits for what the atlas needs to be solved with it
+        self._closing: _Found | None = None  # the atlas is being solved with it
         self._n_asked = 0
         self._rest = REST
         self._rests_until = 0  # counted in `_n_asked`; other maps may be found all the same
@@ -241,20 +222,14 @@ class Revisits:
                     self._provisional = None
             return
         if waiting is None or not agree(self._record.atlas, waiting.match, match):
-            self._provisional = _Provisional(match)
+            self._provisional = _Found(match)
             return
         waiting.match = match
         waiting.confirmations += 1
         if waiting.confirmations < N_CONFIRMING:
             return
-        self._provisional = None
-        self._believe(match, waiting.confirmations)
-
-    def _believe(self, match: PlaceMatch, n_agreeing: int) -> None:
-        """Ask for what the atlas needs to be solved with a place."""
-        then = poses_of(match, self._record.atlas.submaps)
-        assert then is not None, "it was followed to the submaps as they are"
-        self._believed = _Believed(match, n_agreeing, then)
+        self._provisional, self._believed = None, waiting
+        waiting.then = poses_of(match, self._record.atlas.submaps)
         self._connections.foresee(self._link_of(match))
 
     def _link_believed(self, live: VisualOdometry | None, now: FrameStamp) -> AtlasReport | None:
@@ -262,8 +237,17 @@ class Revisits:
         believed, self._believed = self._believed, None
         if believed is None or live is None or live.submap.id != believed.match.query[0]:
             return None
+        assert believed.then is not None, "it was followed to the submaps as they were"
         match = follow_maps(believed.match, believed.then, self._record.atlas.submaps)
-        return None if match is None else self._link(match, believed.confirmations, live, now)
+        if match is None:
+            return None
+        link, believed.match = self._link_of(match), match
+        believed.kind = link.kind
+        report = self._connections.connect_later(link, now)
+        if report is None:  # the atlas has to be solved with it first
+            self._closing = believed
+            return None
+        return self._linked(believed, report, live, now)
 
     def _link_of(self, match: PlaceMatch) -> Link:
         (a, keyframe_a), (b, keyframe_b) = match.place, match.query
@@ -271,18 +255,8 @@ class Revisits:
         kind = LinkKind.LOOP if together else LinkKind.MERGE
         return Link(a, b, match.S_place_query, match.covariance, kind, (), keyframe_a, keyframe_b, doubtful=False)
 
-    def _link(self, match: PlaceMatch, n_agreeing: int, live: VisualOdometry, now: FrameStamp) -> AtlasReport | None:
-        """Give a link to the atlas; None where that has to be solved with it first, or did not take it."""
-        link = self._link_of(match)
-        closing = _Closing(match, n_agreeing, link.kind)
-        report = self._connections.connect_later(link, now)
-        if report is None:
-            self._closing = closing
-            return None
-        return self._linked(closing, report, live, now)
-
     def _linked(
-        self, closing: _Closing, report: AtlasReport, live: VisualOdometry | None, now: FrameStamp
+        self, closing: _Found, report: AtlasReport, live: VisualOdometry | None, now: FrameStamp
     ) -> AtlasReport | None:
         """Record whether a link was accepted, and what follows."""
         atlas, match = self._record.atlas, closing.match

@@ -15,7 +15,8 @@ from dualslam.core.interfaces import Seeker, SubmapGraph
 from dualslam.core.support import judge_track
 from dualslam.core.types import Failure, FailureReason, FloatArray, Track, View
 from dualslam.map.submap import Submap
-from dualslam.places.recogniser import PlaceCandidate, PlaceRecogniser
+from dualslam.places.faiss_index import FaissRecogniser
+from dualslam.places.recogniser import PlaceCandidate
 from dualslam.places.verification import PlaceVerifier
 
 N_CONFIRMING = 2
@@ -33,7 +34,7 @@ SAME_TURN_RAD = float(np.radians(6.0))
 class PlaceParts:
     """Recogniser and verifier of places, made by the composition root."""
 
-    recogniser: PlaceRecogniser
+    recogniser: FaissRecogniser
     verifier: PlaceVerifier
 
 

@@ -8,7 +8,9 @@ The recogniser's candidate and the query keyframe each bring the keyframes that 
 4. All pairs give the similarity again, with its covariance. The gates test keyframes on either side, their spread over
    the image, and sigmas.
 5. A second similarity must not fit as well.
- is not considered: it can neither refute what the pixels prove, nor prove what they do not.
+
+What the maps say of their own drift is not considered: it can neither refute what the pixels prove, nor prove what they
+do not.
 """
 
 from __future__ import annotations
@@ -34,12 +36,14 @@ from dualslam.linking.gates import (
 from dualslam.linking.join_test import JoinGate, LinkEvidence, ambiguity_gate, similarity_gates, support_gate
 from dualslam.map.landmark_views import landmark_covariances
 from dualslam.map.submap import Submap
-from dualslam.places.second_pose import SecondSimilarity, alike, find_second_pose
 from dualslam.places.sides import (
     MIN_FIRST_MATCHES,
     Looks,
     Pairs,
+    SecondSimilarity,
     Side,
+    alike,
+    find_second_pose,
     image_spread,
     keyframes_seeing,
     one_to_one,
@@ -171,15 +175,14 @@ class PlaceVerifier:
 
     def _place_pairs(self, place: Submap, query: Submap, in_place: IntArray, in_query: IntArray) -> Pairs:
         """Look up where the landmarks of pairs are; those that their views do not fix are left out."""
-        half = 0.5 * self._config.deformation_sigma**2
-        xyz, cov = [], []
-        for submap, ids in ((place, in_place), (query, in_query)):
-            points = submap.landmarks["xyz_mu"][ids]
-            spread2 = ((points - np.median(points, axis=0)) ** 2).sum(1) if len(ids) else np.zeros(0)
-            xyz.append(points)
-            cov.append(landmark_covariances(submap, ids) + half * spread2[:, None, None] * np.eye(3))
-        fixed = np.isfinite(np.stack(cov)).all((0, 2, 3))
-        return Pairs(in_place[fixed], in_query[fixed], *(part[fixed] for part in (*xyz, *cov)))
+        (xyz_place, cov_place), (xyz_query, cov_query) = self._points(place, in_place), self._points(query, in_query)
+        return Pairs(in_place, in_query, xyz_place, xyz_query, cov_place, cov_query).fixed()
+
+    def _points(self, submap: Submap, ids: IntArray) -> tuple[FloatArray, FloatArray]:
+        """Return where landmarks are, and their covariances by their views and the deformation of maps."""
+        xyz, half = submap.landmarks["xyz_mu"][ids], 0.5 * self._config.deformation_sigma**2
+        spread2 = ((xyz - np.median(xyz, axis=0)) ** 2).sum(1) if len(ids) else np.zeros(0)
+        return xyz, landmark_covariances(submap, ids) + half * spread2[:, None, None] * np.eye(3)
 
     def _estimate(self, pairs: Pairs, rng: Generator) -> Sim3Estimate | Failure:
         config = self._config
@@ -283,29 +286,15 @@ class PlaceVerifier:
         asked = np.unique(ids[ids >= 0])
         theirs, ours = query.submap.landmarks["descriptor"], place.submap.landmarks["descriptor"]
         i, j = alike(theirs[asked], ours[place.landmarks], self._matcher)
-        cov_query = landmark_covariances(query.submap, asked)
-        cov_place = landmark_covariances(place.submap, place.landmarks)
-        xyz_query = query.submap.landmarks["xyz_mu"][asked]
-        xyz_place = place.submap.landmarks["xyz_mu"][place.landmarks]
-        fixed = np.isfinite(cov_query[i]).all((1, 2)) & np.isfinite(cov_place[j]).all((1, 2))
-        i, j = i[fixed], j[fixed]
-        half = 0.5 * self._config.deformation_sigma**2 * np.eye(3)
-        spread_query = ((xyz_query - np.median(xyz_query, axis=0)) ** 2).sum(1)
-        spread_place = ((xyz_place - np.median(xyz_place, axis=0)) ** 2).sum(1)
-        all_pairs = Pairs(
-            place.landmarks[j],
-            asked[i],
-            xyz_place[j],
-            xyz_query[i],
-            cov_place[j] + half * spread_place[j, None, None],
-            cov_query[i] + half * spread_query[i, None, None],
-        )
+        xyz_query, cov_query = self._points(query.submap, asked)
+        xyz_place, cov_place = self._points(place.submap, place.landmarks)
+        all_pairs = Pairs(place.landmarks[j], asked[i], xyz_place[j], xyz_query[i], cov_place[j], cov_query[i]).fixed()
         return find_second_pose(
             all_pairs.xyz_query,
             all_pairs.xyz_place,
             all_pairs.cov_query,
             all_pairs.cov_place,
-            i,
+            all_pairs.query,
             S,
             all_pairs.mahalanobis2(S) < NEAR_FIRST * PAIR_CHI2,
             rng,

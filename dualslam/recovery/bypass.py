@@ -31,11 +31,7 @@ class Absorption:
 
 
 def pose_frames(
-    record: Record,
-    frames: Sequence[RecoveredFrame],
-    merged: Merged,
-    submap: Submap,
-    change: Change | None = None,
+    record: Record, frames: Sequence[RecoveredFrame], merged: Merged, submap: Submap, change: Change | None = None
 ) -> list[RecoveredFrame]:
     """Carry the frames of a walk into the submap that has taken it in, and enter those that had no pose.
 

@@ -53,7 +53,7 @@ class FrameBuffer:
         self._frozen = False
         self._before_loss: int | None = None  # the newest frame that came before it
         self._stale: set[int] = set()  # frames that are still to be changed
-        self._change: Callable[[View], View] = _as_it_is
+        self._change: Callable[[View], View] = lambda view: view
         self._subject = ""  # of that change
 
     def __len__(self) -> int:
@@ -89,7 +89,8 @@ class FrameBuffer:
         """Take the newest view in and, unless frozen, let go of those that are older than the buffer's duration."""
         self._views.append(view)
         self.nbytes += view.nbytes
-        while self._is_over_full():
+        n_least = SLOW_HZ * self._duration_s
+        while not self._frozen and len(self._views) > n_least and self._age_s(self._views[0]) > self._duration_s:
             self.nbytes -= self._views.popleft().nbytes
         while self._late and self._late[0].index < self._views[0].index:
             self.nbytes -= self._late.popleft().nbytes
@@ -101,10 +102,6 @@ class FrameBuffer:
         """Take in a frame that came too late to be tracked."""
         self._late.append(frame)
         self.nbytes += frame.nbytes
-
-    def _is_over_full(self) -> bool:
-        is_old = not self._frozen and self._age_s(self._views[0]) > self._duration_s
-        return is_old and len(self._views) > SLOW_HZ * self._duration_s
 
     def freeze(self) -> None:
         """Stop dropping old views: the newest one was lost, or there has been no map yet. K = k + k_r."""
@@ -142,17 +139,14 @@ class FrameBuffer:
         if not self._stale:
             return
         n_left = len(self._stale) if n_at_most is None else n_at_most
-        for place in range(len(self._views) - 1, -1, -1):
+        stale = [place for place in reversed(range(len(self._views))) if self._views[place].index in self._stale]
+        for place in stale[:n_left]:
             view = self._views[place]
-            if n_left == 0:
-                return
-            if view.index in self._stale:
-                changed = self._change(view)
-                self.nbytes += changed.nbytes - view.nbytes
-                self._views[place] = changed
-                self._stale.remove(view.index)
-                n_left -= 1
-        self._stale.clear()  # the rest has been let go of
+            self._views[place] = changed = self._change(view)
+            self.nbytes += changed.nbytes - view.nbytes
+            self._stale.remove(view.index)
+        if len(stale) <= n_left:
+            self._stale.clear()  # the rest has been let go of
 
     def backwards_from(self, index: int) -> Iterator[View]:
         """Yield the views that came before frame `index`, the latest first."""
@@ -174,7 +168,9 @@ class FrameBuffer:
         while self._late and self.nbytes > self._max_bytes:
             self.nbytes -= self._late.popleft().nbytes
         views = list(self._views)
-        self._pack(views)
+        for i, view in enumerate(views[:-1]):
+            if self.nbytes > self._max_bytes and view.image is not None:
+                self._put(views, i, replace(view, image=view.image.pack()))
         stretch = self._stretch(views)
         for drop in (_without_image, _without_view):
             while self.nbytes > self._max_bytes and (place := _densest(views, stretch, drop)) is not None:
@@ -188,13 +184,6 @@ class FrameBuffer:
                 self._put(views, place, drop(views[place]))
                 place += len(views) == n
         self._views = deque(views)
-
-    def _pack(self, views: list[View]) -> None:
-        for place, view in enumerate(views[:-1]):
-            if self.nbytes <= self._max_bytes:
-                return
-            if view.image is not None:
-                self._put(views, place, replace(view, image=view.image.pack()))
 
     def _put(self, views: list[View], place: int, view: View | None) -> None:
         """Put a view, or nothing, into the place of another."""
@@ -212,10 +201,6 @@ class FrameBuffer:
         start = next((i + 1 for i, view in enumerate(views) if view.index == self._before_loss), 0)
         recent = next((i for i, view in enumerate(views) if self._age_s(view) <= self._duration_s), len(views))
         return range(start, max(start, recent))
-
-
-def _as_it_is(view: View) -> View:
-    return view
 
 
 def _without_image(view: View) -> View | None:

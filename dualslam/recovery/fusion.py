@@ -122,9 +122,10 @@ def _hand_over(
     n_bypassed = bypass(record, recovered_frames, new_id, newest)
     n_dropped = drop_corrupted(record, found.old_id, corrupted_since)
     n_condemned = condemn_tail(record, recovered_frames, found.old_id, newest, corrupted_since)
-    for frame in recovered_frames:
-        if frame.pose.index >= onset and _was_lost(record, frame.pose.index, found.old_id):
-            record.rows[frame.pose.index].status = FrameStatus.RECOVERED
+    for i in (frame.pose.index for frame in recovered_frames if frame.pose.index >= onset):
+        row = record.rows[i]
+        if row.status is FrameStatus.TRACKED and record.poses[i].submap_id != found.old_id:
+            row.status = FrameStatus.RECOVERED
     record.event(
         EventKind.FUSED,
         now,
@@ -141,8 +142,3 @@ def note_refused(record: Record, found: FoundLink, new_id: int, why: Failure, no
     """Say why a link that a walk had found is not made."""
     data = refusal_data(found.attempt, found.old_id, why)
     record.event(EventKind.LINK_REFUSED, now, new_id, why.gates, **data)
-
-
-def _was_lost(record: Record, index: int, old_id: int) -> bool:
-    tracked = record.rows[index].status is FrameStatus.TRACKED
-    return tracked and record.poses[index].submap_id != old_id

@@ -24,7 +24,6 @@ from dualslam.core.types import Failure, FailureReason, LateFrame, View
 from dualslam.linking.join_test import judge_motion
 from dualslam.linking.link_tries import LinkTries
 from dualslam.linking.motion import gaps_of, join_slack, seam_motions, step_motions
-from dualslam.map.frame_observations import Change
 from dualslam.map.lens import Calibration, rectified_where_possible
 from dualslam.map.solving import solve
 from dualslam.map.split import sound_copy
@@ -362,7 +361,8 @@ class Recoveries:
     ) -> None:
         """Merge a result into its submap, live or archived by now; solve it; pose frames and link maps by it."""
         submap = self._record.atlas.submaps[job.submap.id]
-        change = self._change_of_pixels(job, submap)
+        is_same = (submap.K == job.submap.K).all()
+        change = None if is_same else partial(rectified_where_possible, camera=self._calibration.camera)
         merged = merge_recovery(submap, job.submap, result.submap, change)
         if result.link is not None:
             merged.submap.gauge = gauge_at_overlap(merged.submap, result.link.estimate.agreeing_keyframes)
@@ -404,12 +404,6 @@ class Recoveries:
             self._lost.pop(gone, None)
         if job.lost and absorbed.outgrown_at is not None:
             self._outgrown_at[submap.id] = absorbed.outgrown_at
-
-    def _change_of_pixels(self, job: RecoveryJob, submap: Submap) -> Change | None:
-        """Return what gives a walk the pixels of the camera that its submap has now; None where it is the same."""
-        if (submap.K == job.submap.K).all():
-            return None
-        return partial(rectified_where_possible, camera=self._calibration.camera)
 
     # --- what is lost
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from dualslam.core.firsts import is_first
 from dualslam.core.geometry import se3, sim3
-from dualslam.core.types import BoolArray, FloatArray, IntArray
+from dualslam.core.types import FloatArray, IntArray
 from dualslam.map.anchors import Anchor
 from dualslam.map.frame_observations import Change
 from dualslam.map.submap import NO_LANDMARK, Submap
@@ -42,8 +42,7 @@ def merge_recovery(live: Submap, base: Submap, grown: Submap, change: Change | N
     S_live_grown = change_of_frame(grown, live, base.keyframes, len(base.landmarks))
     moved = grown.copy()
     moved.transform(
-        float(sim3.scale(S_live_grown)),
-        se3.from_parts(sim3.rotation(S_live_grown), sim3.translation(S_live_grown)),
+        float(sim3.scale(S_live_grown)), se3.from_parts(sim3.rotation(S_live_grown), sim3.translation(S_live_grown))
     )
     merged = live.copy()
     _add_keyframes(merged, base, moved, change)
@@ -80,7 +79,7 @@ def _remove_rejected(merged: Submap, base: Submap, moved: Submap) -> None:
     kf, feature, landmark = (base.observations[name][died] for name in ("kf", "feature", "landmark"))
     heir = moved.current_ids(landmark)
     # Those of merged landmarks went over to another one, and those of culled keyframes went with them.
-    judged = ((heir == landmark) | (heir == NO_LANDMARK)) & _held_by(moved, kf)
+    judged = ((heir == landmark) | (heir == NO_LANDMARK)) & np.isin(kf, list(moved.keyframes))
     merged.remove_observations(merged.find_observations(kf[judged], feature[judged], landmark[judged]))
     touched = np.unique(landmark[judged])
     merged.remove_landmarks(touched[merged.n_observations(touched) < 2])
@@ -165,7 +164,3 @@ def _rows_with_a_place(merged: Submap, base: Submap, moved: Submap) -> tuple[Int
     }
     held = feature < np.array([n_common.get(k, 0) for k in kf.tolist()], np.int64)
     return kf[held], feature[held], landmark[held]
-
-
-def _held_by(submap: Submap, kf: IntArray) -> BoolArray:
-    return np.isin(kf, np.fromiter(submap.keyframes, np.int64, len(submap.keyframes)))

@@ -14,8 +14,7 @@ from dualslam.linking import LinkEstimate, LinkRefusal, check_camera, propagate_
 from dualslam.linking.gates import TIE_WINDOW
 from dualslam.linking.rivals import choose_by_velocity
 from dualslam.map.submap import Submap
-from dualslam.recovery.attempts import RecoveryParts
-from dualslam.recovery.job import FoundLink
+from dualslam.recovery.job import FoundLink, RecoveryParts
 from dualslam.recovery.walk import Walk
 
 MIN_SHARED_KEYFRAMES = 4

@@ -32,8 +32,15 @@ from dualslam.linking.motion import WINDOW_FRAMES
 from dualslam.linking.rivals import choose_by_velocity
 from dualslam.map.frame_observations import FrameObservations
 from dualslam.map.submap import Submap
-from dualslam.recovery.attempts import Attempt, RecoveryParts
-from dualslam.recovery.job import FoundLink, RecoveredFrame, RecoveryJob, RecoveryResult, refusal_data
+from dualslam.recovery.job import (
+    Attempt,
+    FoundLink,
+    RecoveredFrame,
+    RecoveryJob,
+    RecoveryParts,
+    RecoveryResult,
+    refusal_data,
+)
 from dualslam.recovery.relinker import Relinker, confirm_link
 from dualslam.recovery.schedule import way_to_gaps
 from dualslam.recovery.walk import Walk
@@ -142,8 +149,7 @@ def _walk_to(gap: int, walk: Walk, parts: RecoveryParts) -> Steps[Walk]:
     job = walk.job
     attempt = next(attempt for attempt in (*parts.attempts, parts.posing) if attempt.name == walk.attempt)
     near = replace(job, views=tuple(view for view in job.views if view.index >= gap))
-    kept = yield from _walk(near, parts, attempt, job.tries)
-    return kept
+    return (yield from _walk(near, parts, attempt, job.tries))
 
 
 def _make_attempt(job: RecoveryJob, parts: RecoveryParts, attempt: Attempt, tries: LinkTries) -> Steps[Walk]:
@@ -153,7 +159,10 @@ def _make_attempt(job: RecoveryJob, parts: RecoveryParts, attempt: Attempt, trie
     it only as far as the gap.
     """
     if (lack := attempt.find_lack()) is not None:
-        return Walk(job, attempt.name, job.submap, tries, lack, events=[_unavailable(job, attempt, lack)])
+        at = job.newest_id, job.submap.keyframes[job.newest_id].timestamp_s, job.submap.id
+        data = {"attempt": attempt.name, "verdict": lack.detail}
+        unavailable = Event(EventKind.ATTEMPT_UNAVAILABLE, *at, data)
+        return Walk(job, attempt.name, job.submap, tries, lack, events=[unavailable])
     walk = yield from _walk(job, parts, attempt, tries)
     events, is_ambiguous = walk.events, bool(walk.rivals)
     if better := _find_better(walk):
@@ -165,12 +174,6 @@ def _make_attempt(job: RecoveryJob, parts: RecoveryParts, attempt: Attempt, trie
         events = [*events, *walk.events]
     walk.events = events
     return walk
-
-
-def _unavailable(job: RecoveryJob, attempt: Attempt, lack: Failure) -> Event:
-    stamp = job.submap.keyframes[job.newest_id].timestamp_s
-    data = {"attempt": attempt.name, "verdict": lack.detail}
-    return Event(EventKind.ATTEMPT_UNAVAILABLE, job.newest_id, stamp, job.submap.id, data)
 
 
 def _find_better(walk: Walk) -> tuple[Rival, ...]:
@@ -310,29 +313,27 @@ def track_in_reverse(
     n_failed, n_unrecognised = 0, 0
     for view in views:
         try:
-            track = judge_track(reverse_tracker.track(view), health)
-            step = _track_one(reverse_tracker, view, track, view.index in keyframe_ids)
+            track: Track | Failure = judge_track(reverse_tracker.track(view), health)
+            report: KeyframeReport | None = None
+            if isinstance(track, Track):
+                reverse_tracker.submap.count_sightings(track)
+                is_wanted = view.index in keyframe_ids and view.index not in reverse_tracker.submap.keyframes
+                if is_wanted or reverse_tracker.keyframe_due(track):
+                    inserted = reverse_tracker.insert_keyframe(track)
+                    if isinstance(inserted, Failure):
+                        track = inserted
+                    else:
+                        report = inserted
+                else:
+                    reverse_tracker.go_by_known(track)
         except SolverError as error:
             log.warning("reverse tracking ends: %s", error)
             yield ReverseStep(view, Failure(FailureReason.SOLVER, str(error)), None)
             return
-        yield step
-        if not isinstance(step.track, Failure):
+        yield ReverseStep(view, track, report)
+        if isinstance(track, Track):
             n_failed, n_unrecognised = 0, 0
             continue
-        n_failed, n_unrecognised = n_failed + 1, n_unrecognised + (step.track.reason is not FailureReason.NO_TEXTURE)
+        n_failed, n_unrecognised = n_failed + 1, n_unrecognised + (track.reason is not FailureReason.NO_TEXTURE)
         if n_failed > max_gap_frames or (max_unrecognised is not None and n_unrecognised >= max_unrecognised):
             return
-
-
-def _track_one(reverse_tracker: VisualOdometry, view: View, track: Track | Failure, is_wanted: bool) -> ReverseStep:
-    """Make a frame that was posed a keyframe where it is wanted or due."""
-    if isinstance(track, Failure):
-        return ReverseStep(view, track, None)
-    reverse_tracker.submap.count_sightings(track)
-    is_new = view.index not in reverse_tracker.submap.keyframes
-    if not ((is_wanted and is_new) or reverse_tracker.keyframe_due(track)):
-        reverse_tracker.go_by_known(track)
-        return ReverseStep(view, track, None)
-    report = reverse_tracker.insert_keyframe(track)
-    return ReverseStep(view, report, None) if isinstance(report, Failure) else ReverseStep(view, track, report)

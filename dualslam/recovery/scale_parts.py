@@ -19,7 +19,7 @@ from dualslam.core.config.settings import LinkingConfig
 from dualslam.core.events import EventKind
 from dualslam.core.types import IntArray
 from dualslam.linking.scale_observability import N_AROUND, answer_scale
-from dualslam.map.residual_noise import noise_excess
+from dualslam.map.landmark_views import noise_excess
 from dualslam.map.split import submap_of
 from dualslam.map.submap import Submap
 from dualslam.recovery.scale_watch import FIRM_TIES, GROUP, SCALE_INFLATION, count_ties, lost_from, question_about

@@ -14,8 +14,7 @@ from dualslam.core.geometry import se3
 from dualslam.core.types import FloatArray
 from dualslam.linking.gates import PIXEL_CHI2
 from dualslam.linking.scale_observability import scale_sigmas_between
-from dualslam.map.landmark_views import landmark_covariances, resection_covariance
-from dualslam.map.residual_noise import noise_excess
+from dualslam.map.landmark_views import landmark_covariances, noise_excess, resection_covariance
 from dualslam.map.submap import Submap
 from dualslam.recovery.scale_watch import GROUP, SCALE_INFLATION
 

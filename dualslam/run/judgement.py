@@ -16,8 +16,7 @@ from dualslam.map.frame_records import FrameRow
 from dualslam.run.measuring import MANY_REJECTED, Measured
 from dualslam.run.results import Trajectories
 from dualslam.system.audit.photometric import Disagreement, Sample, find_disagreement
-from dualslam.system.audit.steps import Steps, measure_steps
-from dualslam.system.audit.verdict import Level, Reason, ReasonCode, Verdict
+from dualslam.system.audit.verdict import Level, Reason, ReasonCode, Steps, Verdict, measure_steps
 from dualslam.system.system import System
 
 MAX_STEP_RATIO = 12.0

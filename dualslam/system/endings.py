@@ -8,8 +8,8 @@ from collections.abc import Mapping, Set
 from dualslam.atlas.atlas import Link
 from dualslam.atlas.connections import Connections
 from dualslam.atlas.endings import archive, part_off
+from dualslam.atlas.propagation import pose_frames_anew, rows_of_frames
 from dualslam.atlas.record import FrameStamp
-from dualslam.atlas.reposing import pose_frames_anew, rows_of_frames
 from dualslam.core.errors import SolverError
 from dualslam.core.events import EventKind
 from dualslam.core.interfaces import VisualOdometry
@@ -38,12 +38,7 @@ class Endings:
     """
 
     def __init__(
-        self,
-        state: State,
-        recoveries: Recoveries,
-        connections: Connections,
-        sightings: Sightings,
-        earlier: Set[int],
+        self, state: State, recoveries: Recoveries, connections: Connections, sightings: Sightings, earlier: Set[int]
     ) -> None:
         self._state = state
         self._recoveries = recoveries

@@ -7,8 +7,8 @@ from collections.abc import Iterable
 from dualslam.atlas.propagation import propagate_links
 from dualslam.atlas.record import FrameStamp
 from dualslam.core.events import EventKind
-from dualslam.map.dead_rows import drop_dead_rows
 from dualslam.map.graph_beside import Moved
+from dualslam.map.submap_delta import drop_dead_rows
 from dualslam.system.state import State
 
 

@@ -80,11 +80,7 @@ class HealthMonitor:
             self._frames.append(FrameHealth(index, (track.reason,), True, track.numbers))
             return verdict
         jump2, innovation = self._jump2(track)
-        numbers = {
-            "inlier_ratio": track.n_inliers / max(track.n_matches, 1),
-            "chi2": track.chi2,
-            "jump2": jump2,
-        }
+        numbers = {"inlier_ratio": track.n_inliers / max(track.n_matches, 1), "chi2": track.chi2, "jump2": jump2}
         signs = self._signs(track, jump2)
         if isinstance(verdict, Failure):
             self._frames.append(FrameHealth(index, (verdict.reason, *signs), True, numbers))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from dualslam.atlas.record import Record
 from dualslam.core.events import EventKind
 from dualslam.core.types import BoolArray, View
 from dualslam.map.submap import Submap
@@ -34,19 +33,14 @@ class Masking:
         share = 0.0 if scene.hidden is None else float(scene.hidden.mean())
         n_removed = 0
         if scene.hidden is not None and state.live is None:
-            self._mask_buffer()
+            # Frames that no map knows by their features are masked, and a start is looked for anew.
+            known = {k for submap in state.record.atlas.submaps.values() for k in submap.keyframes}
+            state.buffer.change_all(lambda views: [v if v.index in known else scene.masked(v) for v in views])
+            self._starting.begin_again()
         elif state.live is not None:
             n_removed = self._clean(state.live.submap)
         submap_id = None if state.live is None else state.live.submap.id
         state.record.event(EventKind.MASKED, view, submap_id, share=share, observations_removed=n_removed)
-
-    def _mask_buffer(self) -> None:
-        """Mask the buffered frames that no map knows by their features, and look for a start anew."""
-        scene, known = self._state.parts.scene, _keyframes(self._state.record)
-        self._state.buffer.change_all(
-            lambda views: [view if view.index in known else scene.masked(view) for view in views]
-        )
-        self._starting.begin_again()
 
     def _clean(self, submap: Submap) -> int:
         """Remove the observations of what stands still from a map; return their number."""
@@ -59,7 +53,3 @@ class Masking:
             still[of_k] = ~scene.shows(submap.keyframes[k].features)[feature[of_k]]
         submap.remove_outliers(rows[still])
         return int(still.sum())
-
-
-def _keyframes(record: Record) -> set[int]:
-    return {k for submap in record.atlas.submaps.values() for k in submap.keyframes}

@@ -88,9 +88,8 @@ class Pace:
         - `n_tracked`: landmarks that the frame tracks.
         - `n_weak`: so few are a weak track (`KeyframeConfig.weak_landmarks`).
         """
-        return n_tracked >= URGENT_TIMES * n_weak and self._puts_off()
-
-    def _puts_off(self) -> bool:
+        if n_tracked < URGENT_TIMES * n_weak:
+            return False
         if not self.behind or self._n_put_off >= MAX_PUT_OFF:
             self._n_put_off = 0
             return False

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable
 
 from dualslam.atlas.record import FrameStamp
+from dualslam.atlas.report import AtlasReport
 from dualslam.atlas.trajectory import FramePose
 from dualslam.core.events import EventKind
 from dualslam.core.interfaces import VisualOdometry
@@ -39,8 +40,7 @@ class PlaceKeeping:
         live = self._state.live
         with self._state.record.timer.measure("places"):
             report = self._revisits.take_solution(live, now)
-        if report is not None and live is not None:
-            self._recoveries.settle(live)
+        self._settle(report, live)
         self._link(now)
 
     def _link(self, now: FrameStamp) -> None:
@@ -50,14 +50,17 @@ class PlaceKeeping:
             return
         with self._state.record.timer.measure("places"):
             report = self._revisits.collect(live, now)
+        self._settle(report, live)
+
+    def _settle(self, report: AtlasReport | None, live: VisualOdometry | None) -> None:
+        """Let no walk look any more for what a link has made one map with the live one."""
         if report is not None and live is not None:
             self._recoveries.settle(live)
 
     def finish(self, last: FrameStamp) -> None:
         """Wait for the places that are being looked for, and link them."""
         live = self._state.live
-        if self._revisits.finish(live, last) is not None and live is not None:
-            self._recoveries.settle(live)
+        self._settle(self._revisits.finish(live, last), live)
 
     def note_keyframe(self, live: VisualOdometry, view: View) -> None:
         """Look for the places that a new keyframe shows: now; in real time, with the next frame that comes in time."""

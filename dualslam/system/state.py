@@ -1,21 +1,37 @@
-"""Where the machine stands between two frames: what its steps share."""
+"""What the steps of the machine share: the parts that it is made of, and where it stands between two frames."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from dualslam.atlas.record import Record
+from dualslam.core.atlas_problem import AtlasSolver
 from dualslam.core.config.settings import Config
-from dualslam.core.interfaces import VisualOdometry
-from dualslam.core.types import View
+from dualslam.core.interfaces import (
+    FinalRefiner,
+    MapStarter,
+    PatchCheck,
+    Scene,
+    Seeker,
+    Shutter,
+    SubmapGraph,
+    VisualOdometry,
+)
+from dualslam.core.types import Failure, FloatArray, Frame, LateFrame, View
+from dualslam.core.walk_news import WalkWatch
 from dualslam.io.map_store import StoredMap
+from dualslam.map.graph_beside import BesideGraphs
+from dualslam.map.lens import Calibration
+from dualslam.map.submap import Submap
+from dualslam.places.sightings import PlaceParts
 from dualslam.recovery.frame_buffer import FrameBuffer
 from dualslam.recovery.relocaliser import Relocaliser
 from dualslam.system.audit.photometric import PhotometricAudit
-from dualslam.system.components import Components
 from dualslam.system.health import HealthMonitor
 from dualslam.system.motion_watch import MotionWatch
 from dualslam.system.pace import Pace
+from dualslam.workers.scheduled_desk import ScheduledDesk
 
 
 @dataclass(slots=True)
@@ -43,3 +59,43 @@ class State:
     def begin_health(self) -> None:
         """Forget the signs of trouble: another map is tracked from now on, or none."""
         self.health = HealthMonitor(self.config.health)
+
+
+@dataclass(frozen=True, slots=True)
+class Components:
+    """The parts that the composition root puts in: the system itself knows neither front end nor solver.
+
+    `keep`: what stays of a frame that came too late to be tracked. `new_relocaliser`: a front end that finds its submap
+    again wherever it is seen, and tracks from there. `walk_watch`: hears of reverse tracking that is under way. `desk`:
+    does the background work. `graphs`: carries changes to submaps' graphs in another process and back, if they are
+    solved there. `refine_at_end`: has the last word on each submap.
+    `patches`: compares frames with the images of older keyframes. `open_graph`: makes a graph of a submap in this
+    process, solved. `open_features`: starts one more process, and returns a function that has the features of a frame
+    found there. `foresee`: precomputes in the background the features that reverse tracking may need. None without
+    background processes.
+    """
+
+    view_of: Callable[[Frame], View | Failure]
+    keep: Callable[[Frame], LateFrame | Failure]
+    new_starter: Callable[[], MapStarter]
+    new_graph: Callable[[], SubmapGraph]
+    new_odometry: Callable[[Submap, SubmapGraph], Seeker]
+    new_relocaliser: Callable[[Submap, SubmapGraph], Seeker]
+    calibration: Calibration
+    shutter: Shutter
+    scene: Scene
+    walk_watch: WalkWatch
+    atlas_solver: AtlasSolver
+    refine_at_end: FinalRefiner
+    patches: PatchCheck
+    places: PlaceParts
+    desk: ScheduledDesk
+    open_graph: Callable[[Submap], SubmapGraph]
+    graphs: BesideGraphs | None = None
+    open_features: Callable[[], Callable[[Frame], Frame]] | None = None
+    foresee: Callable[[View], None] | None = None
+
+    @property
+    def K(self) -> FloatArray:
+        """(3, 3) intrinsics of the rectified pixels, as they are known now."""
+        return self.calibration.camera.K

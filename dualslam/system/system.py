@@ -9,7 +9,7 @@ from functools import partial
 
 from dualslam.atlas.connections import Connections
 from dualslam.atlas.record import FrameStamp, Record
-from dualslam.atlas.worlds import Worlds
+from dualslam.atlas.trajectory import Worlds
 from dualslam.core.camera.base import Camera
 from dualslam.core.config.settings import Config
 from dualslam.core.events import EventKind
@@ -31,7 +31,6 @@ from dualslam.system.audit.photometric import PhotometricAudit
 from dualslam.system.audit.verdict import ReasonCode
 from dualslam.system.camera.background import Calibrations
 from dualslam.system.camera.shutter_watch import ShutterWatch
-from dualslam.system.components import Components
 from dualslam.system.endings import Endings
 from dualslam.system.graphs import GraphKeeping
 from dualslam.system.health import HealthMonitor
@@ -40,7 +39,7 @@ from dualslam.system.motion_watch import Break
 from dualslam.system.places import PlaceKeeping
 from dualslam.system.pose_covariance import PoseCovariance
 from dualslam.system.starting import Starting
-from dualslam.system.state import State
+from dualslam.system.state import Components, State
 from dualslam.system.tracking import Tracking
 from dualslam.workers.scheduled_desk import ScheduledDesk
 
@@ -251,7 +250,9 @@ class System:
         with self.timer.measure("features"):
             view = state.parts.view_of(source)
         if isinstance(view, Failure):
-            outcome: Track | Failure = self._unusable(frame, view)
+            outcome: Track | Failure = view
+            self.rows[frame.index].status = FrameStatus.UNREADABLE
+            self.events.add(EventKind.UNREADABLE, frame.index, frame.timestamp_s, None, detail=view.detail)
             self.blank.add(frame.index)
         else:
             view = replace(view, index=frame.index)
@@ -322,12 +323,6 @@ class System:
             self._endings.pose_frames_anew(shapes)
             self._endings.part_what_lost_its_scale(last)
         state.parts.desk.close()
-
-    def _unusable(self, frame: Frame, failure: Failure) -> Failure:
-        """Record a frame without an image of the right size; tracking continues with the next frame."""
-        self.rows[frame.index].status = FrameStatus.UNREADABLE
-        self.events.add(EventKind.UNREADABLE, frame.index, frame.timestamp_s, None, detail=failure.detail)
-        return failure
 
     # --- without a map
 

@@ -15,7 +15,7 @@ from dualslam.core.interfaces import Seeker, VisualOdometry
 from dualslam.core.support import support_gates
 from dualslam.core.types import Failure, FailureReason, FrameMethod, Track, View
 from dualslam.map.frame_observations import FrameObservations
-from dualslam.system.camera.turns import with_turn_of_poses
+from dualslam.system.camera.shutter_watch import with_turn_of_poses
 from dualslam.system.places import PlaceKeeping
 from dualslam.system.state import State
 

@@ -49,11 +49,7 @@ class ScheduledDesk:
     """
 
     def __init__(
-        self,
-        executor: Executor,
-        policy: Policy = AT_ONCE,
-        finish_wait_s: float = 0.0,
-        budget_s: float | None = None,
+        self, executor: Executor, policy: Policy = AT_ONCE, finish_wait_s: float = 0.0, budget_s: float | None = None
     ) -> None:
         self.executor = executor
         self.on_record: Callable[[dict[str, Any]], None] | None = None

@@ -1,15 +1,18 @@
-"""The search for a start in another process: frames without a map are collected there, and tried while others come."""
+"""In other processes: the search for a start over frames without a map, and the features of the frame to come."""
 
 from __future__ import annotations
 
+import logging
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import count
 
+from dualslam.core.errors import ConfigError
 from dualslam.core.interfaces import MapStarter
 from dualslam.core.jobs import Desk, JobKind
-from dualslam.core.types import Failure, FailureReason, FloatArray, Start, View
+from dualslam.core.types import Failure, FailureReason, FloatArray, Frame, Start, View
+from dualslam.workers.desk import WorkerDesk
 
 MAX_VIEWS = 128
 """Frames that can be sent once more, to a process that takes the place of another: a start looks no farther back."""
@@ -111,3 +114,37 @@ class StartBeside:
         if any(view.index not in own for view in start.views):
             return Failure(FailureReason.TIMEOUT, "the start that was found is of frames long ago")
         return replace(start, views=[own[view.index] for view in start.views])
+
+
+log = logging.getLogger(__name__)
+
+
+class FeaturesBeside:
+    """Has the features of one frame after the other found in another process.
+
+    Called on one thread that is not the tracking's. A process that has died or hangs costs nothing but time: the frame
+    comes back without features, and the tracking process finds them. So do all that follow where no process starts.
+
+    - `desk`: with a lane for features.
+    - `painted`: returns a frame as the front end is to see it.
+    """
+
+    def __init__(self, desk: WorkerDesk, painted: Callable[[Frame], Frame]) -> None:
+        self._desk = desk
+        self._painted = painted
+        self._gave_up = False
+
+    def __call__(self, frame: Frame) -> Frame:
+        """Return the frame with its features."""
+        if frame.image is None or self._gave_up:
+            return frame
+        try:
+            found = self._desk.ask(JobKind.FEATURES, self._painted(frame).image).result
+        except ConfigError as error:
+            log.warning("no more features are found in the background: %s", error)
+            self._gave_up = True
+            return frame
+        if isinstance(found, Failure):
+            log.warning("frame %d: %s; its features are found beside nothing", frame.index, found.detail)
+            return frame
+        return replace(frame, features=found)

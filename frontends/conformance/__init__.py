@@ -20,7 +20,7 @@ from typing import Any
 
 from dualslam.core.conformance import NotConforming, run_checks
 from dualslam.frontends.conformance import features, matching
-from dualslam.frontends.conformance.subject import Subject
+from dualslam.frontends.conformance.scene import Subject
 from dualslam.frontends.registry import FrontendFactory
 
 __all__ = ["CHECKS", "NotConforming", "Subject", "check_frontend"]

@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 from dualslam.core.conformance import expect
 from dualslam.core.errors import ConfigError, InputError
 from dualslam.core.types import Features, FloatArray
-from dualslam.frontends.conformance.scene import PrintedPlane
-from dualslam.frontends.conformance.subject import FEATURES_ARRAYS, Subject, same_features
+from dualslam.frontends.conformance.scene import FEATURES_ARRAYS, PrintedPlane, Subject, same_features
 
 TINY = ((1, 1), (1, 300), (300, 1), (7, 7), (16, 16), (33, 33), (20, 300))
 """Heights and widths."""

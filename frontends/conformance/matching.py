@@ -10,8 +10,7 @@ import numpy as np
 from dualslam.core.conformance import expect
 from dualslam.core.interfaces import Frontend
 from dualslam.core.types import BoolArray, Features, FloatArray, IntArray, Matches
-from dualslam.frontends.conformance.scene import local_zoom, tilted, transfer, turned
-from dualslam.frontends.conformance.subject import Subject
+from dualslam.frontends.conformance.scene import Subject, local_zoom, tilted, transfer, turned
 from dualslam.frontends.features.matching import FeatureGrid, match_projected
 
 MIN_MATCHES = 30

@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 from dualslam.core.camera.base import Camera
 from dualslam.core.geometry import se3
 from dualslam.core.types import BoolArray, FloatArray, IntArray
-from dualslam.frontends.direct.patches import HALF, Patches
-from dualslam.frontends.direct.smear import Smear
+from dualslam.frontends.direct.patches import HALF, Patches, Smear
 from dualslam.frontends.direct.warp import Pyramid, correlate, inside, project_with_jacobians, sample
 
 INNER = HALF - 1
@@ -106,12 +105,7 @@ def agreement(
 
 
 def shift(
-    patches: Patches,
-    levels: Pyramid,
-    placed: Placed,
-    level: int,
-    smear: Smear,
-    prior_px: float,
+    patches: Patches, levels: Pyramid, placed: Placed, level: int, smear: Smear, prior_px: float
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Follow each patch from where the pose puts it.
 

@@ -40,12 +40,7 @@ class PatchMatches:
 
 
 def match_patches(
-    levels_a: Pyramid,
-    levels_b: Pyramid,
-    uv_a_px: FloatArray,
-    uv_b_px: FloatArray,
-    J_b_a: FloatArray,
-    radius_px: float,
+    levels_a: Pyramid, levels_b: Pyramid, uv_a_px: FloatArray, uv_b_px: FloatArray, J_b_a: FloatArray, radius_px: float
 ) -> PatchMatches:
     """Find points of one image (N of them) in another.
 

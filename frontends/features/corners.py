@@ -12,8 +12,8 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
+from dualslam.core.firsts import rank_in_runs
 from dualslam.core.types import BoolArray, FloatArray, IntArray
-from dualslam.frontends.features.groups import rank_in_runs
 
 FAST_RADIUS_PX = 3
 """FAST reads a circle of this radius, so it finds nothing nearer to the edge of what it is given."""

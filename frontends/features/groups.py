@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
+from dualslam.core.interfaces import Frontend
 from dualslam.core.types import BoolArray, FloatArray, IntArray, Matches
 
 ROWS_AT_ONCE = 128
@@ -19,14 +20,6 @@ TURN_TOLERANCE_RAD = np.radians(30.0)
 MIN_TURNS = 8
 """With fewer pairs all are kept: there is no majority to ask."""
 NO_MATCHES = Matches(np.empty((0, 2), np.int64), np.empty(0))
-
-
-def rank_in_runs(group: IntArray) -> IntArray:
-    """Place of each row in its run of equal values, from 0: sorted by group and cost, that is the rank in the group."""
-    place = np.arange(len(group))
-    starts = np.concatenate([[True], group[1:] != group[:-1]])[: len(group)]
-    rank: IntArray = place - np.maximum.accumulate(np.where(starts, place, 0))
-    return rank
 
 
 def lowest_in_group(group: IntArray, cost: FloatArray, n_groups: int) -> FloatArray:
@@ -148,3 +141,19 @@ def _wrapped(angle_rad: FloatArray) -> FloatArray:
     """The same angles in [-pi, pi)."""
     wrapped: FloatArray = (angle_rad + np.pi) % (2 * np.pi) - np.pi
     return wrapped
+
+
+@runtime_checkable
+class AllPairs(Protocol):
+    """A front end that compares all with all in less time than pair by pair."""
+
+    def distances(self, a: NDArray[np.generic], b: NDArray[np.generic]) -> FloatArray:
+        """Distances of descriptors (N, D), (M, D) -> (N, M), each to the bit what `Frontend.distance` says."""
+        ...
+
+
+def all_distances(frontend: Frontend, a: NDArray[np.generic], b: NDArray[np.generic]) -> FloatArray:
+    """Return the distances (N, M) of descriptors (N, D) to others (M, D), N > 0."""
+    if isinstance(frontend, AllPairs):
+        return frontend.distances(a, b)
+    return np.stack([frontend.distance(np.broadcast_to(row, b.shape), b) for row in a])

@@ -11,7 +11,8 @@ from dualslam.core.types import FloatArray
 
 def hamming_distance(a: NDArray[np.generic], b: NDArray[np.generic]) -> FloatArray:
     """Differing bits of paired descriptors (N, 8 k) uint8, (N, 8 k) uint8 -> (N,) float64."""
-    different = np.bitwise_count(_words(a) ^ _words(b)).astype(np.uint16)
+    words_a, words_b = (np.ascontiguousarray(each).view(np.uint64) for each in (a, b))
+    different = np.bitwise_count(words_a ^ words_b).astype(np.uint16)
     # Word by word: numpy's sum along rows of four takes four times as long.
     total = np.zeros(len(different), np.uint16)
     for word in different.T:
@@ -30,8 +31,3 @@ def hamming_matrix(a: NDArray[np.generic], b: NDArray[np.generic]) -> NDArray[np
         faiss.swig_ptr(a), faiss.swig_ptr(b), len(a), len(b), a.shape[1], faiss.swig_ptr(distances)
     )
     return distances
-
-
-def _words(descriptors: NDArray[np.generic]) -> NDArray[np.uint64]:
-    """(N, 8 k) uint8 as (N, k) uint64."""
-    return np.ascontiguousarray(descriptors).view(np.uint64)

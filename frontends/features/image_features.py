@@ -14,7 +14,7 @@ from weakref import WeakKeyDictionary
 from dualslam.core.grey_image import GreyImage
 from dualslam.core.interfaces import Frontend
 from dualslam.core.types import Features
-from dualslam.frontends.asking import features_of
+from dualslam.frontends.features.images import features_of
 
 MAX_BYTES = 48 * 2**20
 """About 120 images of 2000 SIFT features: what a walk sees that ends in a gap. One that gets farther needs no other."""

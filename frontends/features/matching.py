@@ -154,14 +154,7 @@ def match_epipolar(
     """
     uv_a, uv_b = a.uv_rect_px[rows_a], b.uv_rect_px[rows_b]
     first, second = _near_lines(
-        uv_a,
-        uv_b,
-        a.sigma_px[rows_a],
-        b.sigma_px[rows_b],
-        a.octave[rows_a],
-        b.octave[rows_b],
-        F_b_a,
-        octave_tolerance,
+        uv_a, uv_b, a.sigma_px[rows_a], b.sigma_px[rows_b], a.octave[rows_a], b.octave[rows_b], F_b_a, octave_tolerance
     )
     usable = _off_epipole(uv_a, F_b_a, epipole_px)[first] & _off_epipole(uv_b, F_b_a.T, epipole_px)[second]
     first, second = first[usable], second[usable]

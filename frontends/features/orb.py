@@ -30,7 +30,7 @@ from dualslam.frontends.features.groups import NO_MATCHES, consistent_rotation, 
 from dualslam.frontends.features.hamming import hamming_distance, hamming_matrix
 from dualslam.frontends.features.image_noise import estimate_noise, noise_of_levels
 from dualslam.frontends.features.images import to_grey
-from dualslam.frontends.features.optioned import OptionedFrontend
+from dualslam.frontends.registry import OptionedFrontend
 
 PATCH_RADIUS_PX = 15
 """Radius of the disc whose intensity centroid gives the orientation, in pixels of the level (ORB, section 3.2)."""

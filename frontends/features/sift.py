@@ -18,7 +18,7 @@ from dualslam.core.types import BoolArray, Features, FloatArray, IntArray, Match
 from dualslam.frontends.features.corners import grades, select_spread, share_out
 from dualslam.frontends.features.groups import consistent_rotation, mutual_best
 from dualslam.frontends.features.images import to_grey
-from dualslam.frontends.features.optioned import OptionedFrontend
+from dualslam.frontends.registry import OptionedFrontend
 
 DESCRIPTOR_LENGTH = 128
 UNIT = 512

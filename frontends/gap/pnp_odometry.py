@@ -15,7 +15,9 @@ Where the next frame cannot be posed so (blur, black-out, frames that are missin
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence, Set
+from collections.abc import Iterator, Mapping, Sequence, Set
+from dataclasses import dataclass
+from itertools import islice
 from types import MappingProxyType
 
 import numpy as np
@@ -29,9 +31,8 @@ from dualslam.core.geometry import se3
 from dualslam.core.interfaces import SubmapGraph
 from dualslam.core.support import judge_track
 from dualslam.core.types import Failure, FailureReason, FloatArray, Rival, Track, View
-from dualslam.frontends.gap.auxiliary_features import Auxiliary
+from dualslam.frontends.gap.auxiliary_map import Auxiliary
 from dualslam.frontends.gap.pose_finder import SEED_KEYFRAMES, Crossing, PoseFinder
-from dualslam.frontends.gap.route import Route, find_lack
 from dualslam.frontends.tracking.tracker import GivenPose
 from dualslam.frontends.tracking.visual import VisualFrontEnd
 from dualslam.map.submap import Submap
@@ -219,3 +220,32 @@ class PnpOdometry:
     def _note(self, view: View, reference_id: int, T_cam_submap: FloatArray) -> None:
         for finder in self._finders:
             finder.note(view, reference_id, T_cam_submap)
+
+
+MIN_CONTRAST = 4.0
+"""Standard deviation of the greys: sensors have a noise of 1 to 3, and blank images have that alone."""
+N_PREFETCHED = 1
+"""Usable frames beyond the one at hand: a gap relocalisation takes two."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Route:
+    """Start of a walk, and the frames on its way."""
+
+    own: Sequence[View]  # of the submap's own keyframes
+    ahead: Sequence[View]  # in the order in which they will be given
+
+    def usable_after(self, view: View, min_features: int) -> Iterator[View]:
+        """Yield the next frames after one in which features can be found."""
+        place = next((n for n, ahead in enumerate(self.ahead) if ahead.index == view.index), len(self.ahead))
+        usable = (after for after in self.ahead[place + 1 :] if find_lack(after, min_features) is None)
+        return islice(usable, N_PREFETCHED)
+
+
+def find_lack(view: View, min_features: int) -> Failure | None:
+    """Return why a frame is not worth a look; None if it is."""
+    if len(view.features) < min_features:
+        return Failure(FailureReason.NO_TEXTURE, f"{len(view.features)} features in the image")
+    if view.image is not None and view.image.pixels()[::8, ::8].std() < MIN_CONTRAST:
+        return Failure(FailureReason.NO_TEXTURE, "a blank image")
+    return None

@@ -18,22 +18,11 @@ from dualslam.core.config.settings import Config
 from dualslam.core.geometry import se3
 from dualslam.core.geometry.projection import project_points
 from dualslam.core.support import find_lack_of_support, judge_track
-from dualslam.core.types import (
-    Failure,
-    FailureReason,
-    Features,
-    FloatArray,
-    IntArray,
-    Matches,
-    Rival,
-    Track,
-    View,
-)
-from dualslam.frontends.gap.auxiliary_features import Auxiliary
-from dualslam.frontends.gap.auxiliary_map import AuxiliaryMap, triangulate
+from dualslam.core.types import Failure, FailureReason, Features, FloatArray, IntArray, Matches, Rival, Track, View
+from dualslam.frontends.gap.auxiliary_map import Auxiliary, AuxiliaryMap, triangulate
 from dualslam.frontends.gap.consensus import CONFIRMING_SHARE, BeyondGap, are_no_copies, confirmed_share
 from dualslam.frontends.gap.relocalisation import GapPose, relocalise_across_gap
-from dualslam.frontends.gap.second_pose import find_other_poses, match_under, refuse_look_alike
+from dualslam.frontends.gap.second_pose import Sight, find_other_poses, match_under, refuse_look_alike
 from dualslam.frontends.gap.uncertainty import SMALL_STEP
 from dualslam.frontends.tracking.resection import estimate_pose
 from dualslam.frontends.tracking.tracker import GivenPose
@@ -302,30 +291,28 @@ class PoseFinder:
 
     def _refuse_look_alike(self, view: View, wide: GapPose, features: Features, frames: list[int]) -> Failure | None:
         """Return why a gap relocalisation is not believed, if another pose explains nearly as much and is not noted."""
-        rows, xyz = self._points(frames[-1], frames)
-        descriptors = self._map.features(frames[-1]).descriptors[rows]
-        seen = self._frontend, descriptors, xyz, features, wide.T_cam_submap
-        settings = self._submap.K, self._camera, self._config.seed
+        sight, _ = self._sight(frames[-1], frames, features)
+        T, seed = wide.T_cam_submap, self._config.seed
         if not self._notes_rivals:
-            return refuse_look_alike(*seen, *settings, any_is_doubt=self._is_short_cut)
-        others = find_other_poses(*seen, *settings)
+            return refuse_look_alike(sight, T, seed, any_is_doubt=self._is_short_cut)
+        others = find_other_poses(sight, T, seed)
         if others and others[0].makes_doubtful:
-            self._rivals += [Rival(view.index, other.T_cam_w, wide.T_cam_submap) for other in others]
+            self._rivals += [Rival(view.index, other.T_cam_w, T) for other in others]
         return None
 
-    def _points(self, index: int, frames: list[int]) -> tuple[IntArray, FloatArray]:
-        """Return features of a frame (N,) whose points are known from several, and the points (N, 3)."""
+    def _sight(self, index: int, frames: list[int], features: Features) -> tuple[Sight, IntArray]:
+        """Return the points of a frame before the gap that several show, and which of its features (N,) are theirs."""
         rows = self._map.rows_with_track(index)
         xyz, good = triangulate(self._map.views(index, rows, frames), self._submap.K)
-        return rows[good], xyz[good]
+        known = self._map.features(index).descriptors[rows[good]]
+        return Sight(self._frontend, known, xyz[good], features, self._submap.K, self._camera), rows[good]
 
     def _matches_under(self, T_cam_submap: FloatArray, features: Features, frames: list[int]) -> dict[int, Matches]:
         """Match a frame with others where the points that these see should be."""
         matches = {}
         for k in reversed(frames):
-            rows, xyz = self._points(k, frames)
-            of = self._map.features(k).descriptors[rows]
-            found = match_under(self._frontend, of, xyz, features, T_cam_submap, self._submap.K)
+            sight, rows = self._sight(k, frames, features)
+            found = match_under(sight, T_cam_submap)
             matches[k] = Matches(np.column_stack([rows[found.index[:, 0]], found.index[:, 1]]), found.distance)
         return matches
 

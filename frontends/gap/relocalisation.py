@@ -27,8 +27,7 @@ from dualslam.core.geometry.triangulation import triangulate_n_view, triangulate
 from dualslam.core.types import BoolArray, Failure, FailureReason, FloatArray
 from dualslam.frontends.gap.auxiliary_map import TrackViews, triangulate
 from dualslam.frontends.gap.uncertainty import gap_uncertainty
-from dualslam.frontends.gates import MIN_CONSENSUS
-from dualslam.frontends.tracking.resection import resect
+from dualslam.frontends.tracking.resection import MIN_CONSENSUS, resect
 from dualslam.frontends.tracking.two_view_hypotheses import estimate_relative_pose
 
 

@@ -3,7 +3,7 @@
 A ratio test keeps a match only if the best candidate is clearly better than the second. That removes just those that
 would show a repetition. A wrong pose, one period off, may have all of the few that are left. So every point is paired
 with all similar features. The pairs that the first pose explains are removed, and the rest is searched for another
-pose. (The same test for two maps: `dualslam/places/second_pose.py`.)
+pose. (The same test for two maps: `dualslam/places/sides.py`.)
 
 What a pose explains is counted among the points that it has in view. A pose near the last one before the gap has nearly
 all of them in view. By number alone it would win over that of a camera that has moved on by a period.
@@ -12,7 +12,7 @@ all of them in view. By number alone it would win over that of a camera that has
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,13 +20,12 @@ from scipy.spatial import cKDTree
 
 from dualslam.core.camera.base import Camera
 from dualslam.core.chi_square import CHI2_99, MEDIAN_CHI2
+from dualslam.core.firsts import rank_in_runs
 from dualslam.core.geometry.projection import project_points, refine_pose
 from dualslam.core.interfaces import Frontend
 from dualslam.core.types import BoolArray, Failure, FailureReason, Features, FloatArray, IntArray, Matches
-from dualslam.frontends.features.all_pairs import all_distances
-from dualslam.frontends.features.groups import best_per_group, lowest_in_group, rank_in_runs
-from dualslam.frontends.gates import MIN_CONSENSUS
-from dualslam.frontends.tracking.resection import resect
+from dualslam.frontends.features.groups import all_distances, best_per_group, lowest_in_group
+from dualslam.frontends.tracking.resection import MIN_CONSENSUS, resect
 
 DOUBTFUL = 0.15
 """Times what the first pose explains of its view, from which on a second makes it doubtful. On real sequences (car,
@@ -47,6 +46,8 @@ SAME_PX = 12.0
 """Median distance in the image, in sigmas of the pixels, up to which two poses show the points at one place: four times
 what the gate of a match lets through. Texture alone makes nearer neighbours alike. Where points are uncertain
 themselves, as in a map of few keyframes, the sigma is that of the pairs that the first pose explains."""
+AGREES = float(np.sqrt(CHI2_99[2]))
+"""Sigmas of the pixel within which a pose explains a pair."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -66,29 +67,36 @@ class SecondPose:
         return self.support * self.first_in_view >= DOUBTFUL * self.first_support * self.in_view
 
 
-def refuse_look_alike(
-    frontend: Frontend,
-    descriptors: NDArray[np.generic],
-    xyz: FloatArray,
-    features: Features,
-    T_cam_w: FloatArray,
-    K: FloatArray,
-    camera: Camera,
-    seed: int,
-    any_is_doubt: bool = False,
-) -> Failure | None:
+@dataclass(frozen=True, slots=True, eq=False)
+class Sight:
+    """Points that are known from before a gap, and a frame beyond it."""
+
+    frontend: Frontend  # whose descriptors these are
+    descriptors: NDArray[np.generic]  # (N, D): of the points, whether or not they were matched
+    xyz: FloatArray  # (N, 3)
+    features: Features  # of the frame
+    K: FloatArray  # (3, 3)
+    camera: Camera  # as it was given: what self-calibration corrects moves the rim of its image by little
+
+    def explained(self, T_cam_w: FloatArray, point: IntArray, feature: IntArray, sigmas: float) -> BoolArray:
+        """Return which pairs of a point and a feature lie within so many sigmas of the pixel under a pose."""
+        uv, depth = project_points(self.K, T_cam_w, self.xyz[point])
+        off_px = np.linalg.norm(uv - self.features.uv_rect_px[feature], axis=1)
+        return np.asarray((depth > 0) & (off_px < sigmas * self.features.sigma_px[feature]))
+
+    def n_in_view(self, T_cam_w: FloatArray) -> int:
+        """Count the points that a pose has in the image."""
+        uv, depth = project_points(self.K, T_cam_w, self.xyz)
+        return int(np.count_nonzero((depth > 0) & self.camera.shows(uv)))
+
+
+def refuse_look_alike(sight: Sight, T_cam_w: FloatArray, seed: int, any_is_doubt: bool = False) -> Failure | None:
     """Return why a pose beyond a gap is not to be believed, if another one explains nearly as much.
 
-    - `K` (3, 3).
-    - `frontend`: whose descriptors these are.
-    - `descriptors` (N, D), `xyz` (N, 3): what is known of before the gap, whether or not it was matched.
-    - `features`: of the frame beyond the gap.
     - `T_cam_w` (4, 4): the first pose.
-    - `camera`: as it was given: what self-calibration corrects moves the rim of its image by little.
     - `any_is_doubt`: however few points another pose explains, the first is not believed; all points are compared.
     """
-    n_points = len(xyz) if any_is_doubt else N_POINTS
-    others = find_other_poses(frontend, descriptors, xyz, features, T_cam_w, K, camera, seed, n_points)
+    others = find_other_poses(sight, T_cam_w, seed, len(sight.xyz) if any_is_doubt else N_POINTS)
     if not others or not (others[0].makes_doubtful or any_is_doubt):
         return None
     second = others[0]
@@ -105,49 +113,42 @@ def refuse_look_alike(
     return Failure(FailureReason.LOOK_ALIKE, detail, numbers)
 
 
-def find_other_poses(
-    frontend: Frontend,
-    descriptors: NDArray[np.generic],
-    xyz: FloatArray,
-    features: Features,
-    T_cam_w: FloatArray,
-    K: FloatArray,
-    camera: Camera,
-    seed: int,
-    n_points: int = N_POINTS,
-) -> list[SecondPose]:
+def find_other_poses(sight: Sight, T_cam_w: FloatArray, seed: int, n_points: int = N_POINTS) -> list[SecondPose]:
     """Look for other poses among the pairs that the first one leaves over, each of which shows the points elsewhere.
 
-    Parameters as `refuse_look_alike`. The one that explains most of its view comes first.
+    The one that explains most of its view comes first.
     """
-    chosen, seen = _spread(len(xyz), n_points), _spread(len(features), N_FEATURES)
-    xyz, features = xyz[chosen], features.take(seen)
-    point, feature, rank = _alike(frontend, descriptors[chosen], features.descriptors)
-    explained = _explained(T_cam_w, xyz[point], features, feature, K)
-    first_support, first_in_view = len(np.unique(point[explained])), _n_in_view(T_cam_w, xyz, K, camera)
+    chosen, seen = _spread(len(sight.xyz), n_points), _spread(len(sight.features), N_FEATURES)
+    xyz, features, K = sight.xyz[chosen], sight.features.take(seen), sight.K
+    sight = replace(sight, descriptors=sight.descriptors[chosen], xyz=xyz, features=features)
+    point, feature, rank = _alike(sight.frontend, sight.descriptors, features.descriptors)
+    explained = sight.explained(T_cam_w, point, feature, AGREES)
+    first_support, first_in_view = len(np.unique(point[explained])), sight.n_in_view(T_cam_w)
     rest = np.flatnonzero(~explained)
     if len(rest) < MIN_CONSENSUS:
         return []
-    uv, sigma = features.uv_rect_px[feature[rest]], features.sigma_px[feature[rest]]
+    of_rest, at_rest = point[rest], feature[rest]
+    uv, sigma = features.uv_rect_px[at_rest], features.sigma_px[at_rest]
     sigma_px = float(np.median(sigma))
-    starts = [*_shifted(T_cam_w, xyz[point[rest]], uv, K, sigma_px)]
+    starts = [*_shifted(T_cam_w, xyz[of_rest], uv, K, sigma_px)]
     drawn = np.flatnonzero(rank[rest] < N_DRAWN)
     if len(drawn) >= MIN_CONSENSUS:
-        starts.append(resect(K, camera.size_px, uv[drawn], xyz[point[rest[drawn]]], sigma_px, seed, HYPOTHESES).T_cam_w)
-    same_px = SAME_PX * max(sigma_px, _spread_px(T_cam_w, xyz, features, point, feature, K))
+        size_px = sight.camera.size_px
+        starts.append(resect(K, size_px, uv[drawn], xyz[of_rest[drawn]], sigma_px, seed, HYPOTHESES).T_cam_w)
+    same_px = SAME_PX * max(sigma_px, _spread_px(sight, T_cam_w, point, feature))
     found: list[SecondPose] = []
     for T_start in starts:
-        near = _within(T_start, xyz[point[rest]], uv, K, SAME_PX * sigma)
+        near = sight.explained(T_start, of_rest, at_rest, SAME_PX)
         if np.count_nonzero(near) < MIN_CONSENSUS:
             continue
-        refined = refine_pose(K, T_start, xyz[point[rest[near]]], uv[near], sigma[near])
+        refined = refine_pose(K, T_start, xyz[of_rest[near]], uv[near], sigma[near])
         if isinstance(refined, Failure):
             continue
         T = refined.T_cam_w
-        held = np.unique(point[_explained(T, xyz[point], features, feature, K)])
+        held = np.unique(point[sight.explained(T, point, feature, AGREES)])
         if len(held) < MIN_CONSENSUS or _are_one(T_cam_w, T, xyz[held], K, same_px):
             continue
-        found.append(SecondPose(T, len(held), first_support, _n_in_view(T, xyz, K, camera), first_in_view))
+        found.append(SecondPose(T, len(held), first_support, sight.n_in_view(T), first_in_view))
     others: list[SecondPose] = []
     for second in sorted(found, key=lambda second: second.support / second.in_view, reverse=True):
         if not any(_are_one(second.T_cam_w, other.T_cam_w, xyz, K, same_px) for other in others):
@@ -182,25 +183,18 @@ def _shifted(
         left &= np.linalg.norm(votes - votes[top], axis=1) > radius
 
 
-def match_under(
-    frontend: Frontend,
-    descriptors: NDArray[np.generic],
-    xyz: FloatArray,
-    features: Features,
-    T_cam_w: FloatArray,
-    K: FloatArray,
-) -> Matches:
-    """Match what is known with what looks like it and lies where a pose shows it; parameters as `refuse_look_alike`.
+def match_under(sight: Sight, T_cam_w: FloatArray) -> Matches:
+    """Match what is known with what looks like it and lies where a pose shows it.
 
     Of what repeats itself the copy that the pose has in view is not the one that looks most alike.
     """
-    distance = all_distances(frontend, descriptors, features.descriptors)
-    i, j = np.nonzero(distance <= frontend.max_distance_strict)
-    near = _within(T_cam_w, xyz[i], features.uv_rect_px[j], K, SAME_PX * features.sigma_px[j])
+    distance = all_distances(sight.frontend, sight.descriptors, sight.features.descriptors)
+    i, j = np.nonzero(distance <= sight.frontend.max_distance_strict)
+    near = sight.explained(T_cam_w, i, j, SAME_PX)
     i, j = i[near], j[near]
     cost = np.asarray(distance[i, j], np.float64)
     best_of_both = np.intersect1d(
-        best_per_group(i, cost, len(descriptors)), best_per_group(j, cost, len(features)), assume_unique=True
+        best_per_group(i, cost, len(sight.xyz)), best_per_group(j, cost, len(sight.features)), assume_unique=True
     )
     best_of_both = best_of_both[np.argsort(cost[best_of_both], kind="stable")]
     return Matches(np.column_stack([i[best_of_both], j[best_of_both]]), cost[best_of_both])
@@ -223,29 +217,12 @@ def _alike(frontend: Frontend, a: NDArray[np.generic], b: NDArray[np.generic]) -
     return i[among_nearest], j[among_nearest], rank[among_nearest]
 
 
-def _explained(T_cam_w: FloatArray, xyz: FloatArray, features: Features, feature: IntArray, K: FloatArray) -> BoolArray:
-    reach = np.sqrt(CHI2_99[2]) * features.sigma_px[feature]
-    return _within(T_cam_w, xyz, features.uv_rect_px[feature], K, reach)
-
-
-def _within(T_cam_w: FloatArray, xyz: FloatArray, uv_px: FloatArray, K: FloatArray, reach_px: FloatArray) -> BoolArray:
-    uv, depth = project_points(K, T_cam_w, xyz)
-    return np.asarray((depth > 0) & (np.linalg.norm(uv - uv_px, axis=1) < reach_px))
-
-
-def _n_in_view(T_cam_w: FloatArray, xyz: FloatArray, K: FloatArray, camera: Camera) -> int:
-    uv, depth = project_points(K, T_cam_w, xyz)
-    return int(np.count_nonzero((depth > 0) & camera.shows(uv)))
-
-
-def _spread_px(
-    T_cam_w: FloatArray, xyz: FloatArray, features: Features, point: IntArray, feature: IntArray, K: FloatArray
-) -> float:
+def _spread_px(sight: Sight, T_cam_w: FloatArray, point: IntArray, feature: IntArray) -> float:
     """Return the sigma of the pairs that a pose explains or nearly does: pixels and points are uncertain."""
-    uv, depth = project_points(K, T_cam_w, xyz[point])
-    off_px = np.where(depth > 0, np.linalg.norm(uv - features.uv_rect_px[feature], axis=1), np.inf)
-    nearest = lowest_in_group(point, off_px, len(xyz))
-    near = nearest[nearest < 4 * SAME_PX * float(np.median(features.sigma_px))]
+    uv, depth = project_points(sight.K, T_cam_w, sight.xyz[point])
+    off_px = np.where(depth > 0, np.linalg.norm(uv - sight.features.uv_rect_px[feature], axis=1), np.inf)
+    nearest = lowest_in_group(point, off_px, len(sight.xyz))
+    near = nearest[nearest < 4 * SAME_PX * float(np.median(sight.features.sigma_px))]
     return float(np.median(near) / np.sqrt(MEDIAN_CHI2[2])) if len(near) else 0.0
 
 

@@ -10,7 +10,7 @@ from dualslam.core.camera.base import Camera
 from dualslam.core.geometry import se3
 from dualslam.core.interfaces import Frontend
 from dualslam.core.types import Failure, FailureReason, Track
-from dualslam.frontends.gap.second_pose import refuse_look_alike
+from dualslam.frontends.gap.second_pose import Sight, refuse_look_alike
 from dualslam.frontends.gap.uncertainty import SMALL_STEP, track_uncertainty
 from dualslam.map.submap import Submap
 
@@ -33,12 +33,7 @@ def refuse_lost_scale(submap: Submap, track: Track, last: Track, max_scale_sigma
 
 
 def refuse_second_pose(
-    submap: Submap,
-    track: Track,
-    keyframe_ids: Sequence[int],
-    frontend: Frontend,
-    camera: Camera,
-    seed: int,
+    submap: Submap, track: Track, keyframe_ids: Sequence[int], frontend: Frontend, camera: Camera, seed: int
 ) -> Failure | None:
     """Refuse a track if another pose explains nearly as much of what some keyframes see, by their own descriptors."""
     features, ids, known = [], [], np.zeros(len(submap.landmarks), bool)
@@ -48,13 +43,6 @@ def refuse_second_pose(
         ids.append(submap.landmark_of[k][row])
         features.append(submap.keyframes[k].features.descriptors[row])
         known[ids[-1]] = True
-    return refuse_look_alike(
-        frontend,
-        np.concatenate(features),
-        submap.landmarks["xyz_mu"][np.concatenate(ids)],
-        track.view.features,
-        track.T_cam_submap,
-        submap.K,
-        camera,
-        seed,
-    )
+    xyz = submap.landmarks["xyz_mu"][np.concatenate(ids)]
+    sight = Sight(frontend, np.concatenate(features), xyz, track.view.features, submap.K, camera)
+    return refuse_look_alike(sight, track.T_cam_submap, seed)

@@ -15,6 +15,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from operator import itemgetter
 
 import numpy as np
 import poselib
@@ -114,15 +115,45 @@ class _Pair:
     sigma_px: float
     radius_px: float
 
-    def straightened(self, lens: float) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return the pixels without the lens, and by how much it has shrunk their surroundings (N,)."""
-        (a, zoom_a), (b, zoom_b) = (_straighten(uv, lens, self.radius_px) for uv in (self.uv_a, self.uv_b))
-        return a, b, 0.5 * (zoom_a + zoom_b)
+    def straightened(self, lens: float) -> _Straight:
+        """Return the pair without the lens."""
+        xy_a, xy_b = self.uv_a / self.radius_px, self.uv_b / self.radius_px
+        a, b = (self.radius_px * undistort_division(xy, lens) for xy in (xy_a, xy_b))
+        zoom_a, zoom_b = (np.abs(division_area_ratio(xy, lens)) ** -0.5 for xy in (xy_a, xy_b))
+        return _Straight(a, b, 0.5 * (zoom_a + zoom_b), self.sigma_px)
 
 
-def _straighten(uv_px: FloatArray, lens: float, radius_px: float) -> tuple[FloatArray, FloatArray]:
-    xy = uv_px / radius_px
-    return radius_px * undistort_division(xy, lens), np.abs(division_area_ratio(xy, lens)) ** -0.5
+@dataclass(frozen=True, slots=True, eq=False)
+class _Straight:
+    """A pair as cameras without a lens would have seen it."""
+
+    a: FloatArray  # (N, 2)
+    b: FloatArray  # (N, 2)
+    zoom: FloatArray  # (N,): by how much the lens had shrunk the pixels' surroundings
+    sigma_px: float
+
+    def fresh_pose(
+        self, focal: float, iterations: tuple[int, int] = FINE_ITERATIONS, seed: int = 0
+    ) -> poselib.CameraPose:
+        """Return a relative pose by RANSAC, of at least and at most so many iterations."""
+        least, most = iterations
+        gate_px = 3.0 * self.sigma_px
+        options = {"max_epipolar_error": gate_px, "min_iterations": least, "max_iterations": most, "seed": seed}
+        camera = poselib_camera(_K(focal), (1, 1))
+        return poselib.estimate_relative_pose(self.a, self.b, camera, camera, options, {})[0]
+
+    def best_cost(self, focal: float, starts: Sequence[poselib.CameraPose]) -> tuple[float, poselib.CameraPose]:
+        """Return the least robust cost of the epipolar constraint from some poses on, and its pose."""
+        K = _K(focal)
+        camera = poselib_camera(K, (1, 1))
+        options = {"loss_type": "CAUCHY", "loss_scale": self.sigma_px, "max_iterations": 15}
+        found = []
+        for start in starts:
+            pose, _ = poselib.refine_relative_pose(self.a, self.b, start, camera, camera, options)
+            F = fundamental_from_pose(K, se3.from_parts(pose.R, pose.t))
+            error2 = sampson_error(F, self.a, self.b) / (self.zoom * self.sigma_px) ** 2
+            found.append((float(np.log1p(error2).sum()), pose))
+        return min(found, key=itemgetter(0))
 
 
 def _find_pairs(
@@ -163,13 +194,12 @@ def _costs_on_coarse_grid(pair: _Pair, focals: FloatArray, seed: int) -> FloatAr
     """Return the pair's cost at every camera, (lenses, focals): that of the coarse grid's nearest."""
     costs = np.empty((len(LENSES), len(focals)))
     for row in range(0, len(LENSES), COARSE):
-        a, b, zoom = pair.straightened(LENSES[row])
-        pose = None
+        straight, pose = pair.straightened(LENSES[row]), None
         for column in range(0, len(focals), COARSE):
             starts = [] if pose is None else [pose]
             if column % (2 * COARSE) == 0:
-                starts.append(_fresh_pose(a, b, focals[column], pair.sigma_px, COARSE_ITERATIONS, seed))
-            cost, pose = _best_cost(a, b, zoom, focals[column], pair.sigma_px, starts)
+                starts.append(straight.fresh_pose(focals[column], COARSE_ITERATIONS, seed))
+            cost, pose = straight.best_cost(focals[column], starts)
             costs[row : row + COARSE, column : column + COARSE] = cost
     return costs
 
@@ -178,50 +208,12 @@ def _refine_cell(pair: _Pair, costs: FloatArray, focals: FloatArray, row: int, c
     """Ask a pair about all cameras of a cell of the coarse grid, from the pose of its corner on."""
     pose = None
     for i in range(row, min(row + COARSE, len(LENSES))):
-        a, b, zoom = pair.straightened(LENSES[i])
+        straight = pair.straightened(LENSES[i])
         along = range(column, column + COARSE)
         for j in along if (i - row) % 2 == 0 else reversed(along):
             if pose is None:
-                pose = _fresh_pose(a, b, focals[j], pair.sigma_px)
-            costs[i, j], pose = _best_cost(a, b, zoom, focals[j], pair.sigma_px, [pose])
-
-
-def _fresh_pose(
-    a: FloatArray,
-    b: FloatArray,
-    focal: float,
-    sigma_px: float,
-    iterations: tuple[int, int] = FINE_ITERATIONS,
-    seed: int = 0,
-) -> poselib.CameraPose:
-    """Return a relative pose by RANSAC, of at least and at most so many iterations."""
-    least, most = iterations
-    options = {"max_epipolar_error": 3.0 * sigma_px, "min_iterations": least, "max_iterations": most, "seed": seed}
-    camera = poselib_camera(_K(focal), (1, 1))
-    return poselib.estimate_relative_pose(a, b, camera, camera, options, {})[0]
-
-
-def _best_cost(
-    a: FloatArray,
-    b: FloatArray,
-    zoom: FloatArray,
-    focal: float,
-    sigma_px: float,
-    starts: Sequence[poselib.CameraPose],
-) -> tuple[float, poselib.CameraPose]:
-    """Return the least robust cost of the epipolar constraint from some poses on, and its pose."""
-    K = _K(focal)
-    camera = poselib_camera(K, (1, 1))
-    best: tuple[float, poselib.CameraPose] | None = None
-    for start in starts:
-        options = {"loss_type": "CAUCHY", "loss_scale": sigma_px, "max_iterations": 15}
-        pose, _ = poselib.refine_relative_pose(a, b, start, camera, camera, options)
-        F = fundamental_from_pose(K, se3.from_parts(pose.R, pose.t))
-        cost = float(np.log1p(sampson_error(F, a, b) / (zoom * sigma_px) ** 2).sum())
-        if best is None or cost < best[0]:
-            best = cost, pose
-    assert best is not None
-    return best
+                pose = straight.fresh_pose(focals[j])
+            costs[i, j], pose = straight.best_cost(focals[j], [pose])
 
 
 def _K(focal: float) -> FloatArray:
@@ -258,28 +250,19 @@ def _log_likelihood(costs: FloatArray, on_grid: FloatArray, pairs: Sequence[_Pai
 
 
 def _between_nodes(
-    pairs: Sequence[_Pair],
-    costs: FloatArray,
-    side: int,
-    log_focal: float,
-    lens: float | None,
-    told: ToldFocal | None,
+    pairs: Sequence[_Pair], costs: FloatArray, side: int, log_focal: float, lens: float | None, told: ToldFocal | None
 ) -> tuple[float, float]:
     """Return the best log focal length and lens near a node of the grid, which is coarser than many pairs are sure.
 
     Without a lens none is looked for.
     """
-    poses = []
-    for pair in pairs:
-        a, b, _ = pair.straightened(lens or 0.0)
-        poses.append(_fresh_pose(a, b, side * np.exp(log_focal), pair.sigma_px))
+    poses = [pair.straightened(lens or 0.0).fresh_pose(side * np.exp(log_focal)) for pair in pairs]
 
     def misfit(x: np.ndarray[tuple[int], np.dtype[np.float64]]) -> float:
         log_f, bend = float(x[0]), float(x[1]) if lens is not None else 0.0
         found = np.empty(len(pairs))
         for i, pair in enumerate(pairs):
-            a, b, zoom = pair.straightened(bend)
-            found[i], poses[i] = _best_cost(a, b, zoom, side * np.exp(log_f), pair.sigma_px, [poses[i]])
+            found[i], poses[i] = pair.straightened(bend).best_cost(side * np.exp(log_f), [poses[i]])
         prior = _log_prior(np.array(log_f), np.array(bend), told)
         return -float(prior) - float(_log_likelihood(found, costs, pairs).sum())
 

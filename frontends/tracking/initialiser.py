@@ -35,10 +35,9 @@ from dualslam.core.types import (
     View,
 )
 from dualslam.frontends.features.motion_statistics import match_by_motion, nearest_search
-from dualslam.frontends.gates import MIN_CONSENSUS
 from dualslam.frontends.tracking.direction import direction_angle_deg, direction_sigma_deg
 from dualslam.frontends.tracking.near_points import N_PROOF, nearer_than_proven, stands_before
-from dualslam.frontends.tracking.resection import resect
+from dualslam.frontends.tracking.resection import MIN_CONSENSUS, resect
 from dualslam.frontends.tracking.two_view_hypotheses import MIN_NOISE2, RelativePoses
 
 MIN_POINTS = 50

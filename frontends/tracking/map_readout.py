@@ -17,11 +17,11 @@ from scipy import sparse
 
 from dualslam.core.chi_square import MEDIAN_CHI2
 from dualslam.core.estimates import ReadoutEstimate
+from dualslam.core.firsts import rank_in_runs
 from dualslam.core.geometry import se3
 from dualslam.core.geometry.projection import project_points, projection_jacobians
 from dualslam.core.robust import huber_weights
 from dualslam.core.types import BoolArray, Failure, FailureReason, FloatArray, IntArray
-from dualslam.frontends.features.groups import rank_in_runs
 from dualslam.map.submap import Submap
 
 MAX_KEYFRAMES = 40

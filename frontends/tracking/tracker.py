@@ -18,12 +18,11 @@ from dualslam.core.geometry.projection import PoseEstimate, project_points, refi
 from dualslam.core.interfaces import Frontend
 from dualslam.core.types import Failure, FailureReason, FloatArray, IntArray, Track, View
 from dualslam.frontends.features.matching import FeatureGrid, match_projected
-from dualslam.frontends.gates import MIN_CONSENSUS
 from dualslam.frontends.tracking.beyond_gap import refuse_lost_scale, refuse_second_pose
 from dualslam.frontends.tracking.local_map import LocalMap, Prediction, covering_keyframes, trusted
 from dualslam.frontends.tracking.motion import Motion
 from dualslam.frontends.tracking.pixel_search import PixelSearch
-from dualslam.frontends.tracking.resection import estimate_pose
+from dualslam.frontends.tracking.resection import MIN_CONSENSUS, estimate_pose
 from dualslam.map.submap import NO_LANDMARK, Submap
 
 SEARCH_RADIUS_PX = 15.0

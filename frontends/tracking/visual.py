@@ -19,11 +19,10 @@ from dualslam.core.interfaces import N_WINDOW, Frontend, SubmapGraph, WindowSolv
 from dualslam.core.types import Failure, FailureReason, FloatArray, FrameMethod, IntArray, Rival, Track, View
 from dualslam.frontends.gap.refinding import Refinder
 from dualslam.frontends.gap.uncertainty import track_uncertainty
-from dualslam.frontends.tracking.keyframing import keyframe_due, keyframe_like
+from dualslam.frontends.tracking.keyframing import keyframe_due, keyframe_like, passes_unmapped
 from dualslam.frontends.tracking.mapper import Mapper
 from dualslam.frontends.tracking.pixel_search import PixelSearch
 from dualslam.frontends.tracking.tracker import GivenPose, Tracker
-from dualslam.frontends.tracking.unmapped import passes_unmapped
 from dualslam.map.anchors import RelativePose
 from dualslam.map.submap import Submap
 from dualslam.map.submap_change import change_of_frame

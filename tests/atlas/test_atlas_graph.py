@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from dualslam.atlas.atlas import ROLLOVER_SIGMAS, Link, LinkKind
-from dualslam.atlas.bending import bend_submap
+from dualslam.atlas.moving import bend_submap
 from dualslam.atlas.warp import Warp
 from dualslam.backend.atlas_solver import GtsamAtlasSolver
 from dualslam.backend.submap_graph import ISam2SubmapGraph

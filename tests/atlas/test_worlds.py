@@ -8,7 +8,7 @@ from itertools import pairwise
 import numpy as np
 
 from dualslam.atlas.atlas import Atlas, Link, LinkKind
-from dualslam.atlas.worlds import Worlds
+from dualslam.atlas.trajectory import Worlds
 from dualslam.core.events import EventKind
 from dualslam.core.geometry import sim3
 from dualslam.map.frame_records import FrameResult

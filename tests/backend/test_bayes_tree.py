@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from dualslam.backend.bayes_tree import parse_bayes_tree
+from dualslam.backend.solver import parse_bayes_tree
 from dualslam.backend.submap_graph import ISam2SubmapGraph
 from dualslam.core.config.settings import GraphConfig
 from dualslam.core.errors import SolverError

@@ -13,10 +13,10 @@ import pytest
 
 from dualslam.backend import convert, schur
 from dualslam.backend.calibration_bundle import CorrectedLens
-from dualslam.backend.factors import insert_projections, pose_prior
 from dualslam.backend.point_refinement import huber
 from dualslam.backend.schur import Loss, System, geman_mcclure, optimise
 from dualslam.backend.solver import optimise_batch
+from dualslam.backend.ties import insert_projections, pose_prior
 from dualslam.core.bundle import BundleProblem
 from dualslam.core.errors import SolverError
 from dualslam.testing.graph_scene import Feeder, make_scene, pose_errors

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from dualslam.backend.selection import Candidates, choose_factors, rank_in_runs, spread_evenly
+from dualslam.backend.selection import Candidates, choose_factors, spread_evenly
+from dualslam.core.firsts import rank_in_runs
 
 N_KEYFRAMES, N_LANDMARKS, WIDTH = 30, 800, 640.0
 

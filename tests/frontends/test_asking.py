@@ -15,8 +15,8 @@ from dualslam.cli import main
 from dualslam.core.config.files import load_config
 from dualslam.core.errors import FrontendError
 from dualslam.core.types import Features, Matches
-from dualslam.frontends.asking import features_of
 from dualslam.frontends.conformance import Subject
+from dualslam.frontends.features.images import features_of
 from dualslam.frontends.features.orb import OrbFrontend
 from tests.cli.conftest import _own_environment  # noqa: F401 (used by every test)
 

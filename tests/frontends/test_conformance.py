@@ -67,7 +67,7 @@ def test_one_of_another_package_conforms(check: Callable[[Subject], None]) -> No
 
 @pytest.mark.usefixtures("with_example")
 def test_it_is_known_by_its_name_and_refuses_unknown_options() -> None:
-    assert registry.known_frontends() == sorted([*registry.BUILT_IN, "patches"])
+    assert registry.FRONTENDS.known == sorted([*registry.BUILT_IN, "patches"])
     config = FrontendConfig(name="patches", n_features=70, options={"quality": 0.1})
     assert registry.create_frontend(config).n_features == 70  # type: ignore[attr-defined]
     with pytest.raises(ConfigError, match=r"frontend\.options\.qualty.*quality"):

@@ -53,7 +53,7 @@ def offer(monkeypatch: pytest.MonkeyPatch, **entries: str) -> None:
 
 def test_entry_points_are_found(monkeypatch: pytest.MonkeyPatch) -> None:
     offer(monkeypatch, theirs="dualslam.frontends.features.orb:OrbFrontend", orb="nowhere:Nothing")
-    assert registry.known_frontends() == sorted([*registry.BUILT_IN, "theirs"])
+    assert registry.FRONTENDS.known == sorted([*registry.BUILT_IN, "theirs"])
     assert isinstance(registry.create_frontend(FrontendConfig(name="theirs")), OrbFrontend)
     assert isinstance(registry.create_frontend(FrontendConfig(name="orb")), OrbFrontend)
 

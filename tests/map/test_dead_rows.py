@@ -10,11 +10,10 @@ from dualslam.core.config.settings import GraphConfig
 from dualslam.core.estimates import GraphEstimate
 from dualslam.core.jobs import InlineDesk, JobKind
 from dualslam.core.types import Failure, FailureReason, IntArray
-from dualslam.map import dead_rows
-from dualslam.map.dead_rows import drop_dead_rows
-from dualslam.map.graph_beside import BesideGraphs, GraphAnswer, GraphJob, GraphServer
+from dualslam.map import submap_delta
+from dualslam.map.graph_beside import BesideGraphs, GraphJob, GraphServer
 from dualslam.map.submap import Submap
-from dualslam.map.submap_delta import SubmapMirror
+from dualslam.map.submap_delta import SubmapMirror, drop_dead_rows
 from dualslam.system.system import System
 from dualslam.testing.graph_scene import Feeder, make_scene
 from dualslam.testing.late_desk import LateDesk
@@ -64,7 +63,7 @@ def assert_same(a: GraphEstimate, b: GraphEstimate) -> None:
 @pytest.fixture
 def no_minimum(monkeypatch: pytest.MonkeyPatch) -> None:
     """Small maps drop their rows, too."""
-    monkeypatch.setattr(dead_rows, "MIN_DEAD", 1)
+    monkeypatch.setattr(submap_delta, "MIN_DEAD", 1)
 
 
 class All:
@@ -125,13 +124,13 @@ def test_a_replica_follows_a_submap_that_drops_its_dead_rows_and_its_graph_too()
             delta = mirror.delta(submap)
             assert delta.is_whole == (k == 3)
             answer = server(GraphJob(0, delta, k == 20, True))
-            assert isinstance(answer, GraphAnswer)
+            assert isinstance(answer, GraphEstimate)
             replica = server._graphs[0][0]
             np.testing.assert_array_equal(replica.observations["alive"], submap.observations["alive"])
-            rows = answer.estimate.outlier_rows
-            answers.append((answer.estimate, named(submap, rows)))
+            rows = answer.outlier_rows
+            answers.append((answer, named(submap, rows)))
             assert named(replica, rows) == named(submap, rows)
-            submap.apply_estimate(*answer.estimate.values)
+            submap.apply_estimate(*answer.values)
             submap.remove_outliers(rows)
         assert_same(answers[0][0], answers[1][0])
         assert answers[0][1] == answers[1][1]
@@ -210,7 +209,7 @@ def test_the_table_of_a_camera_that_stays_is_bounded_and_its_poses_are_the_same(
 ) -> None:
     world = there_and_back(100)
     thin, lengths = went(world, system_in(world, **DENSE))
-    monkeypatch.setattr(dead_rows, "MIN_DEAD", 1 << 60)
+    monkeypatch.setattr(submap_delta, "MIN_DEAD", 1 << 60)
     plain, unbounded = went(world, system_in(world, **DENSE))
     assert thin.atlas.submaps[0].n_dropped > 0
     assert unbounded[-1] > max(lengths)
@@ -227,10 +226,10 @@ def test_answers_that_come_late_name_the_rows_that_were_sent() -> None:
     """No row leaves while a graph is solving: what it calls an outlier is what it was sent as such a row."""
     server, told = GraphServer(lambda: ISam2SubmapGraph(GraphConfig())), []
 
-    def solve(job: GraphJob) -> GraphAnswer | Failure:
+    def solve(job: GraphJob) -> GraphEstimate | Failure:
         answer = server(job)
-        assert isinstance(answer, GraphAnswer)
-        told.append(named(server._graphs[job.graph_id][0], answer.estimate.outlier_rows))
+        assert isinstance(answer, GraphEstimate)
+        told.append(named(server._graphs[job.graph_id][0], answer.outlier_rows))
         return answer
 
     desk = LateDesk(InlineDesk({JobKind.GRAPH: solve}), 2)

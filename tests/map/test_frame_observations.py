@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from dualslam.atlas.endings import part_off
+from dualslam.atlas.propagation import pose_frames_anew, rows_of_frames
 from dualslam.atlas.record import MAX_OBSERVED, Record
-from dualslam.atlas.reposing import pose_frames_anew, rows_of_frames
 from dualslam.atlas.trajectory import FramePose
 from dualslam.core.geometry import se3
 from dualslam.core.types import Features, FrameStatus

@@ -12,12 +12,14 @@ import numpy as np
 import pytest
 
 from dualslam.backend.submap_graph import ISam2SubmapGraph
-from dualslam.build import build_system, graph_handlers, window_solver
+from dualslam.build import build_system, window_solver
+from dualslam.build.parts import graph_maker
 from dualslam.core.config.settings import Config
 from dualslam.core.errors import SolverError
+from dualslam.core.estimates import GraphEstimate
 from dualslam.core.jobs import InlineDesk, JobKind
 from dualslam.core.types import Failure, FailureReason, FrameStatus
-from dualslam.map.graph_beside import BesideGraph, BesideGraphs, GraphAnswer, GraphJob, GraphServer
+from dualslam.map.graph_beside import BesideGraph, BesideGraphs, GraphJob, GraphServer
 from dualslam.map.lens import change_camera
 from dualslam.map.solving import open_graph
 from dualslam.map.submap import Submap
@@ -93,7 +95,7 @@ def no_window(submap: Submap, keyframe_ids: list[int]) -> Failure:
 def beside(world: PointWorld, polls: int, **settings: object) -> System:
     """A system whose graphs are solved inline, but come back late, by way of a delta as to another process."""
     system = system_in(world, **settings)
-    desk = LateDesk(InlineDesk(graph_handlers(system._state.config)), polls)
+    desk = LateDesk(InlineDesk({JobKind.GRAPH: GraphServer(graph_maker(system._state.config))}), polls)
     graphs = BesideGraphs(desk, window_solver(system._state.config), partial(open_graph, new_graph=new_isam2))
     system._state.parts = replace(system._state.parts, new_graph=graphs.new_graph, graphs=graphs)
     system._recoveries._new_graph = graphs.new_graph
@@ -160,7 +162,7 @@ def test_a_graph_that_fails_at_the_end_keeps_no_other_from_being_solved(reason: 
     server, failing = GraphServer(lambda: ISam2SubmapGraph(Config().graph)), {1}
     scenes = [make_scene(6, noise_px=0.5, seed=m) for m in range(2)]
 
-    def solve(job: GraphJob) -> GraphAnswer | Failure:
+    def solve(job: GraphJob) -> GraphEstimate | Failure:
         return Failure(reason, "as it was told") if job.graph_id in failing else server(job)
 
     graphs = BesideGraphs(InlineDesk({JobKind.GRAPH: solve}), no_window, partial(open_graph, new_graph=new_isam2))

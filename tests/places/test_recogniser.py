@@ -13,7 +13,7 @@ from dualslam.frontends.features.hamming import hamming_distance
 from dualslam.frontends.features.sift import SiftFrontend
 from dualslam.map.submap import Submap
 from dualslam.places import FaissRecogniser
-from dualslam.places.cells import N_CELLS, shipped_cells
+from dualslam.places.faiss_index import N_CELLS, shipped_cells
 from tests.places.worlds import N_LAP, driven_lap, lap
 
 MAX_BITS = 50.0

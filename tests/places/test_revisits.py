@@ -14,7 +14,7 @@ from dualslam.core.events import Event, EventKind
 from dualslam.core.jobs import Ended, InlineDesk, JobKind
 from dualslam.core.types import Failure, FailureReason, FloatArray, FrameStatus
 from dualslam.linking.join_test import drift_gate
-from dualslam.places.search import PlaceSearch
+from dualslam.places.recogniser import PlaceSearch
 from dualslam.run.results import trajectories_of
 from dualslam.system.system import System
 from dualslam.testing.late_desk import LateDesk

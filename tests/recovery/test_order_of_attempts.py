@@ -11,8 +11,7 @@ from dualslam.core.config.settings import HealthConfig
 from dualslam.core.jobs import result_of
 from dualslam.core.types import Failure, FailureReason
 from dualslam.linking.link_tries import LinkTries
-from dualslam.recovery.attempts import Attempt
-from dualslam.recovery.job import RecoveryJob, RecoveryResult
+from dualslam.recovery.job import Attempt, RecoveryJob, RecoveryResult
 from dualslam.recovery.reverse_tracking import recover_in_steps, track_in_reverse
 from dualslam.recovery.walk import Walk
 

@@ -223,7 +223,7 @@ def test_a_walk_ends_at_a_tear_and_leaves_nothing_beyond_it(monkeypatch: pytest.
     def torn(*_: object) -> LinkRefusal:
         return LinkRefusal(FailureReason.DEFORMED, "the new map is torn", torn_at=max(COVERED) + 1, walk_sigma=np.inf)
 
-    monkeypatch.setattr("dualslam.recovery.attempts.estimate_link", torn)
+    monkeypatch.setattr("dualslam.recovery.job.estimate_link", torn)
     world = PointWorld(cloud(600), hand_held(60), covered=COVERED)
     system = system_in(world, recovery={"enabled": True, "retry_keyframes": []})
     for frame in world.frames():

@@ -11,7 +11,7 @@ from dualslam.core.types import Failure, Frame
 from dualslam.frontends.features.orb import OrbFrontend
 from dualslam.testing.desk_work import lane, working
 from dualslam.workers.desk import MAX_STILLBORN, Lane
-from dualslam.workers.features_beside import FeaturesBeside
+from dualslam.workers.start_beside import FeaturesBeside
 from tests.workers.test_stillborn import end_at_once
 
 

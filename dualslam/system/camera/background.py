@@ -92,11 +92,7 @@ class Calibrations:
         return self._calibration.camera is not before
 
     def _take(
-        self,
-        job: CalibrationJob,
-        result: CalibrationAnswer | Failure,
-        live: VisualOdometry | None,
-        now: FrameStamp,
+        self, job: CalibrationJob, result: CalibrationAnswer | Failure, live: VisualOdometry | None, now: FrameStamp
     ) -> None:
         """Let submap, graph, buffer and lost submaps change to the camera that was found, all of them or none."""
         failure = result if isinstance(result, Failure) else self._take_answer(job, result, live, now)
@@ -109,11 +105,7 @@ class Calibrations:
         self._record.event(EventKind.CALIBRATED, now, job.submap.id, lost=failure, **result.numbers)
 
     def _take_answer(
-        self,
-        job: CalibrationJob,
-        answer: CalibrationAnswer,
-        live: VisualOdometry | None,
-        now: FrameStamp,
+        self, job: CalibrationJob, answer: CalibrationAnswer, live: VisualOdometry | None, now: FrameStamp
     ) -> list[int] | Failure:
         """Return the lost submaps that have changed, too."""
         if live is None or live.submap.id != job.submap.id:

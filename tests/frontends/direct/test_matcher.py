@@ -17,7 +17,7 @@ from dualslam.core.pixels import PixelMatches
 from dualslam.core.types import FloatArray
 from dualslam.frontends.conformance.scene import PrintedPlane, transfer
 from dualslam.frontends.direct.matcher import DirectMatcher
-from dualslam.frontends.direct.smear import Smear
+from dualslam.frontends.direct.patches import Smear
 from dualslam.frontends.direct.warp import project_with_jacobians
 from dualslam.lab.disturbances.images import corrupt_image
 from dualslam.testing.pixel_matching import CAMERA, CHECKS, SIZE_PX, plane_views

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from dualslam.core.interfaces import Frontend
-from dualslam.frontends.features.all_pairs import AllPairs, all_distances
+from dualslam.frontends.features.groups import AllPairs, all_distances
 from dualslam.frontends.features.orb import OrbFrontend
 from dualslam.frontends.features.sift import SiftFrontend
 

@@ -22,8 +22,7 @@ from dualslam.core.errors import ConfigError
 from dualslam.core.interfaces import Frontend
 from dualslam.frontends.features.kornia import weights
 from dualslam.frontends.features.kornia.matchers import _cross_attention
-from dualslam.frontends.features.kornia.networks import Network
-from dualslam.frontends.features.kornia.weights import DETECTOR, LIGHTGLUE, Checkpoint
+from dualslam.frontends.features.kornia.weights import DETECTOR, LIGHTGLUE, Checkpoint, Network
 from dualslam.frontends.registry import create_frontend
 from tests.frontends.conftest import textured
 from tests.frontends.features.test_kornia import on_cuda

@@ -13,11 +13,9 @@ from dualslam.core.config.settings import Config
 from dualslam.core.geometry import se3
 from dualslam.core.types import Failure, FailureReason, Features, FloatArray, Track, View
 from dualslam.frontends.features.orb import OrbFrontend
-from dualslam.frontends.gap.auxiliary_features import Auxiliary
-from dualslam.frontends.gap.auxiliary_map import AuxiliaryMap, TrackViews, triangulate
-from dualslam.frontends.gap.pnp_odometry import PnpOdometry
+from dualslam.frontends.gap.auxiliary_map import Auxiliary, AuxiliaryMap, TrackViews, triangulate
+from dualslam.frontends.gap.pnp_odometry import PnpOdometry, Route
 from dualslam.frontends.gap.relocalisation import GapPose, relocalise_across_gap
-from dualslam.frontends.gap.route import Route
 from dualslam.frontends.gap.second_pose import SecondPose
 from dualslam.map.submap import NO_LANDMARK
 from dualslam.testing.point_world import CAMERA, SIZE_PX, PointWorld, cloud, path, random_features

@@ -10,7 +10,7 @@ from dualslam.core.geometry import se3
 from dualslam.core.geometry.projection import project_points
 from dualslam.core.types import FailureReason, Features, FloatArray
 from dualslam.frontends.features.orb import OrbFrontend
-from dualslam.frontends.gap.second_pose import find_other_poses, match_under, refuse_look_alike
+from dualslam.frontends.gap.second_pose import Sight, find_other_poses, match_under, refuse_look_alike
 from tests.seeds import first_of
 
 CAMERA = PinholeCamera(640, 480, 400.0, 400.0, 320.0, 240.0)
@@ -53,7 +53,7 @@ def test_what_repeats_is_refused_whichever_pose_came_first(seed: int) -> None:
     a_period_off = T.copy()
     a_period_off[:3, 3] += T[:3, :3] @ [PERIOD_M, 0.0, 0.0]
     for first in (T, a_period_off):
-        refused = refuse_look_alike(ORB, descriptors, xyz, features, first, K, CAMERA, seed)
+        refused = refuse_look_alike(Sight(ORB, descriptors, xyz, features, K, CAMERA), first, seed)
         assert refused is not None
         assert refused.reason is FailureReason.LOOK_ALIKE
         assert refused.numbers["second_pose"] >= 12
@@ -62,14 +62,14 @@ def test_what_repeats_is_refused_whichever_pose_came_first(seed: int) -> None:
 @pytest.mark.parametrize("seed", first_of(range(3)))
 def test_all_poses_that_are_a_period_off_are_told_and_each_has_its_own_matches(seed: int) -> None:
     xyz, descriptors, features, T = sight(60, 0, seed)
-    others = find_other_poses(ORB, descriptors, xyz, features, T, K, CAMERA, seed)
+    others = find_other_poses(Sight(ORB, descriptors, xyz, features, K, CAMERA), T, seed)
     places = np.array([np.linalg.inv(other.T_cam_w)[0, 3] - np.linalg.inv(T)[0, 3] for other in others])
     assert len(others) >= 2
     assert np.abs(places / PERIOD_M - np.round(places / PERIOD_M)).max() < 0.05
     assert {-1.0, 1.0} <= set(np.round(places / PERIOD_M).tolist())
     assert len(set(np.round(places / PERIOD_M).tolist())) == len(places), "no place twice"
     for T_cam_w in (T, *(other.T_cam_w for other in others)):
-        found = match_under(ORB, descriptors, xyz, features, T_cam_w, K)
+        found = match_under(Sight(ORB, descriptors, xyz, features, K, CAMERA), T_cam_w)
         uv, _ = project_points(K, T_cam_w, xyz[found.index[:, 0]])
         assert len(found) >= 12
         assert np.unique(found.index[:, 0]).size == np.unique(found.index[:, 1]).size == len(found)
@@ -85,7 +85,7 @@ def test_a_pose_that_has_little_of_what_was_seen_in_view_is_none_the_worse_for_i
     T = np.eye(4)
     T[0, 3] = -3.0 * PERIOD_M
     features, _ = seen_from(T, xyz, descriptors, seed)
-    second, *_ = find_other_poses(ORB, descriptors[before], xyz[before], features, np.eye(4), K, CAMERA, seed)
+    second, *_ = find_other_poses(Sight(ORB, descriptors[before], xyz[before], features, K, CAMERA), np.eye(4), seed)
     assert np.linalg.norm(second.T_cam_w[:3, 3] - T[:3, 3]) < 0.1
     assert second.support < 0.5 * second.first_support
     assert second.support > 0.9 * second.in_view
@@ -95,17 +95,17 @@ def test_a_pose_that_has_little_of_what_was_seen_in_view_is_none_the_worse_for_i
 @pytest.mark.parametrize("seed", first_of(range(3)))
 def test_what_does_not_repeat_has_one_pose(seed: int) -> None:
     xyz, descriptors, features, T = sight(0, 250, seed)
-    assert find_other_poses(ORB, descriptors, xyz, features, T, K, CAMERA, seed) == []
+    assert find_other_poses(Sight(ORB, descriptors, xyz, features, K, CAMERA), T, seed) == []
 
 
 def test_few_things_that_repeat_leave_the_pose_certain() -> None:
     xyz, descriptors, features, T = sight(5, 250, 4)
-    assert refuse_look_alike(ORB, descriptors, xyz, features, T, K, CAMERA, 4) is None
-    refused = refuse_look_alike(ORB, descriptors, xyz, features, T, K, CAMERA, 4, any_is_doubt=True)
+    assert refuse_look_alike(Sight(ORB, descriptors, xyz, features, K, CAMERA), T, 4) is None
+    refused = refuse_look_alike(Sight(ORB, descriptors, xyz, features, K, CAMERA), T, 4, any_is_doubt=True)
     assert refused is not None  # where others can decide
     assert refused.numbers["second_pose"] < 0.5 * refused.numbers["first_pose"]
 
 
 def test_nothing_to_compare_is_no_second_pose() -> None:
     xyz, descriptors, features, T = sight(0, 250, 5)
-    assert find_other_poses(ORB, descriptors[:0], xyz[:0], features, T, K, CAMERA, 5) == []
+    assert find_other_poses(Sight(ORB, descriptors[:0], xyz[:0], features, K, CAMERA), T, 5) == []

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from dualslam.core.types import FloatArray
-from dualslam.system.audit.steps import measure_steps
+from dualslam.system.audit.verdict import measure_steps
 
 TIMES = np.arange(200) / 30
 SUSPECT = 6.0

@@ -23,7 +23,7 @@ from dualslam.core.geometry import se3, so3
 from dualslam.core.types import Failure, FailureReason, Features, FloatArray, Frame, View
 from dualslam.map.lens import Calibration
 from dualslam.map.submap import Submap
-from dualslam.system.camera.turns import turn_rates
+from dualslam.system.camera.shutter_watch import turn_rates
 from dualslam.system.system import System
 from tests.backend.test_self_calibration import TRUE, make_submap, wrong_camera
 
