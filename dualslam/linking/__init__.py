@@ -12,10 +12,9 @@ In reading order:
 - `motion`: the camera's motion across gaps and seams. `link_tries`: earlier tries.
 """
 
-from dualslam.linking.camera_bend import NO_BEND, Bend, check_camera
 from dualslam.linking.correspondences import Correspondences, DescriptorMatcher, propose_correspondences
 from dualslam.linking.estimate import LinkEstimate, LinkRefusal, estimate_link
-from dualslam.linking.live_end import propagate_to_live_end
+from dualslam.linking.live_end import NO_BEND, Bend, check_camera, propagate_to_live_end
 
 __all__ = [
     "NO_BEND",

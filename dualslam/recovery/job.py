@@ -16,9 +16,9 @@ from dualslam.core.events import Event
 from dualslam.core.interfaces import SubmapGraph, VisualOdometry
 from dualslam.core.types import Failure, FloatArray, FrameMethod, IntArray, LateFrame, View
 from dualslam.linking import DescriptorMatcher, LinkEstimate, estimate_link
-from dualslam.linking.link_tries import LinkTries
 from dualslam.map.frame_observations import FrameObservations
 from dualslam.map.submap import Submap
+from dualslam.recovery.schedule import LinkTries
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -22,7 +22,6 @@ from dualslam.core.interfaces import SubmapGraph, VisualOdometry
 from dualslam.core.jobs import Desk, Ended, JobKind
 from dualslam.core.types import Failure, FailureReason, LateFrame, View
 from dualslam.linking.join_test import judge_motion
-from dualslam.linking.link_tries import LinkTries
 from dualslam.linking.motion import gaps_of, join_slack, seam_motions, step_motions
 from dualslam.map.lens import Calibration, rectified_where_possible
 from dualslam.map.solving import solve
@@ -34,7 +33,7 @@ from dualslam.recovery.frame_buffer import FrameBuffer
 from dualslam.recovery.fusion import fuse, gauge_at_overlap, note_refused, tighten
 from dualslam.recovery.job import FoundLink, RecoveryJob, RecoveryResult, path_of
 from dualslam.recovery.merge import merge_recovery
-from dualslam.recovery.schedule import RetrySchedule, as_far_as_it_leads, way_to_gaps
+from dualslam.recovery.schedule import LinkTries, RetrySchedule, as_far_as_it_leads, way_to_gaps
 
 
 @dataclass(frozen=True, slots=True)

@@ -27,7 +27,6 @@ from dualslam.core.support import judge_track
 from dualslam.core.types import Failure, FailureReason, Rival, Track, View
 from dualslam.core.walk_news import WalkNews, WalkTrace
 from dualslam.linking import LinkRefusal
-from dualslam.linking.link_tries import LinkTries
 from dualslam.linking.motion import WINDOW_FRAMES
 from dualslam.linking.rivals import choose_by_velocity
 from dualslam.map.frame_observations import FrameObservations
@@ -42,7 +41,7 @@ from dualslam.recovery.job import (
     refusal_data,
 )
 from dualslam.recovery.relinker import Relinker, confirm_link
-from dualslam.recovery.schedule import way_to_gaps
+from dualslam.recovery.schedule import LinkTries, way_to_gaps
 from dualslam.recovery.walk import Walk
 
 log = logging.getLogger(__name__)

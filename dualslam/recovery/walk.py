@@ -11,10 +11,10 @@ from dualslam.core.decisions import Gate
 from dualslam.core.events import Event, EventKind
 from dualslam.core.types import Failure, FailureReason, Rival
 from dualslam.linking import LinkRefusal
-from dualslam.linking.link_tries import LinkTries
 from dualslam.linking.rivals import Choice
 from dualslam.map.submap import Submap
 from dualslam.recovery.job import FoundLink, RecoveredFrame, RecoveryJob, path_of
+from dualslam.recovery.schedule import LinkTries
 
 
 @dataclass(slots=True, eq=False)

@@ -11,7 +11,7 @@ all of them in view. By number alone it would win over that of a camera that has
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -23,9 +23,10 @@ from dualslam.core.chi_square import CHI2_99, MEDIAN_CHI2
 from dualslam.core.firsts import rank_in_runs
 from dualslam.core.geometry.projection import project_points, refine_pose
 from dualslam.core.interfaces import Frontend
-from dualslam.core.types import BoolArray, Failure, FailureReason, Features, FloatArray, IntArray, Matches
+from dualslam.core.types import BoolArray, Failure, FailureReason, Features, FloatArray, IntArray, Matches, Track
 from dualslam.frontends.features.groups import all_distances, best_per_group, lowest_in_group
 from dualslam.frontends.tracking.resection import MIN_CONSENSUS, resect
+from dualslam.map.submap import Submap
 
 DOUBTFUL = 0.15
 """Times what the first pose explains of its view, from which on a second makes it doubtful. On real sequences (car,
@@ -111,6 +112,22 @@ def refuse_look_alike(sight: Sight, T_cam_w: FloatArray, seed: int, any_is_doubt
         f" this one {second.first_support} of {second.first_in_view}"
     )
     return Failure(FailureReason.LOOK_ALIKE, detail, numbers)
+
+
+def refuse_second_pose(
+    submap: Submap, track: Track, keyframe_ids: Sequence[int], frontend: Frontend, camera: Camera, seed: int
+) -> Failure | None:
+    """Refuse a track if another pose explains nearly as much of what some keyframes see, by their own descriptors."""
+    features, ids, known = [], [], np.zeros(len(submap.landmarks), bool)
+    for k in keyframe_ids:
+        row = np.flatnonzero(submap.landmark_of[k] >= 0)
+        row = row[~known[submap.landmark_of[k][row]]]
+        ids.append(submap.landmark_of[k][row])
+        features.append(submap.keyframes[k].features.descriptors[row])
+        known[ids[-1]] = True
+    xyz = submap.landmarks["xyz_mu"][np.concatenate(ids)]
+    sight = Sight(frontend, np.concatenate(features), xyz, track.view.features, submap.K, camera)
+    return refuse_look_alike(sight, track.T_cam_submap, seed)
 
 
 def find_other_poses(sight: Sight, T_cam_w: FloatArray, seed: int, n_points: int = N_POINTS) -> list[SecondPose]:

@@ -9,8 +9,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from dualslam.core.geometry import se3
 from dualslam.core.geometry.projection import projection_jacobians
-from dualslam.core.types import FloatArray, IntArray, Track
+from dualslam.core.types import Failure, FailureReason, FloatArray, IntArray, Track
 from dualslam.map.landmark_views import landmark_covariances
 from dualslam.map.submap import Submap
 
@@ -78,3 +79,20 @@ def track_uncertainty(submap: Submap, track: Track) -> tuple[FloatArray, float] 
     row = np.flatnonzero(track.landmark_ids >= 0)
     sigma_px = track.view.features.sigma_px[row]
     return pose_uncertainty(submap, track.T_cam_submap, track.landmark_ids[row], sigma_px)
+
+
+def refuse_lost_scale(submap: Submap, track: Track, last: Track, max_scale_sigma: float) -> Failure | None:
+    """Refuse a track across a gap that does not hold the scale, which all that is mapped beyond the gap will inherit.
+
+    A step from the last track that is small against the depth of what is seen leaves the scale where it is.
+    """
+    ids = track.landmark_ids[track.landmark_ids >= 0]
+    step = se3.inverse(track.T_cam_submap)[:3, 3] - se3.inverse(last.T_cam_submap)[:3, 3]
+    if np.linalg.norm(step) < SMALL_STEP * np.median(submap.depths(ids, track.T_cam_submap)):
+        return None
+    known = track_uncertainty(submap, track)
+    scale_sigma = np.inf if known is None else known[1]
+    if scale_sigma <= max_scale_sigma:
+        return None
+    detail = f"the scale beyond the gap is known to {scale_sigma:.1%}"
+    return Failure(FailureReason.SCALE, detail, {"gap_scale_sigma": scale_sigma})

@@ -18,7 +18,8 @@ from dualslam.core.geometry.projection import PoseEstimate, project_points, refi
 from dualslam.core.interfaces import Frontend
 from dualslam.core.types import Failure, FailureReason, FloatArray, IntArray, Track, View
 from dualslam.frontends.features.matching import FeatureGrid, match_projected
-from dualslam.frontends.tracking.beyond_gap import refuse_lost_scale, refuse_second_pose
+from dualslam.frontends.gap.second_pose import refuse_second_pose
+from dualslam.frontends.gap.uncertainty import refuse_lost_scale
 from dualslam.frontends.tracking.local_map import LocalMap, Prediction, covering_keyframes, trusted
 from dualslam.frontends.tracking.motion import Motion
 from dualslam.frontends.tracking.pixel_search import PixelSearch

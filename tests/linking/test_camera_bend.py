@@ -19,7 +19,7 @@ from dualslam.core.estimates import PreferredCamera
 from dualslam.core.geometry import se3, sim3, so3
 from dualslam.core.types import Failure, FailureReason, IntArray
 from dualslam.linking import NO_BEND, Bend, LinkEstimate, check_camera, propagate_to_live_end
-from dualslam.linking.camera_bend import measure_bend
+from dualslam.linking.live_end import measure_bend
 from dualslam.map.submap import Submap
 from tests.backend.test_self_calibration import TRUE, make_submap, wrong_camera
 from tests.linking.test_scale_observability import THERE, linked

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from dualslam.core.types import FailureReason
-from dualslam.linking.link_tries import RISK, LinkTries, tightened
+from dualslam.recovery.schedule import RISK, LinkTries, tightened
 
 MAX_SIGMA = 0.025
 

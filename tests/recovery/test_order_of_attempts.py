@@ -10,9 +10,9 @@ import pytest
 from dualslam.core.config.settings import HealthConfig
 from dualslam.core.jobs import result_of
 from dualslam.core.types import Failure, FailureReason
-from dualslam.linking.link_tries import LinkTries
 from dualslam.recovery.job import Attempt, RecoveryJob, RecoveryResult
 from dualslam.recovery.reverse_tracking import recover_in_steps, track_in_reverse
+from dualslam.recovery.schedule import LinkTries
 from dualslam.recovery.walk import Walk
 
 BLANK, UNKNOWN = Failure(FailureReason.NO_TEXTURE), Failure(FailureReason.DEGENERATE)
