@@ -87,7 +87,7 @@ def _execute(args: argparse.Namespace) -> int:
         )
         _tell_left_out(np.setdiff1d(all_views, exported.frame), min(numbers.values(), default=0))
         if source is not None and chosen.next_command:
-            print(f"next: {chosen.next_command.format(out=args.out)}", flush=True)
+            print(f"next, {chosen.next_command.format(out=args.out.absolute())}", flush=True)
     return 0
 
 

@@ -22,12 +22,14 @@ class ExportFormat:
     is_folder: bool = False  # whether the path is a folder; else one file
     has_images: bool = False  # whether the views' images belong to it
     has_colours: bool = False  # whether its points have colours
-    next_command: str = ""  # to type next, with the path as ``{out}``; empty if there is none
+    next_command: str = ""  # where and what to type next, with the path as ``{out}``; empty if there is none
 
 
-GSPLAT = "python examples/simple_trainer.py default --data_factor 1 --data_dir {out} --result_dir {out}_splat"
-"""In a checkout of gsplat (github.com/nerfstudio-project/gsplat)."""
-NERFSTUDIO = "ns-train splatfacto --data {out}"
+GSPLAT = (
+    "in a checkout of gsplat (github.com/nerfstudio-project/gsplat): "
+    "python examples/simple_trainer.py default --data_factor 1 --data_dir {out} --result_dir {out}_splat"
+)
+NERFSTUDIO = "with nerfstudio installed: ns-train splatfacto --data {out}"
 
 FORMATS = {
     "bal": ExportFormat(write_bal),
