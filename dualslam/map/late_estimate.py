@@ -66,3 +66,4 @@ def _move_points(submap: Submap, before: Submap, known: IntArray, landmark_ids: 
     of_each = moves[place]
     xyz = before.landmarks["xyz_mu"][ids]
     lm["xyz_mu"][ids] = np.einsum("nij,nj->ni", of_each[:, :3, :3], xyz) + of_each[:, :3, 3]
+    lm["distance_mu"][ids] *= scale

@@ -386,11 +386,30 @@ class Submap:
     def apply_estimate(
         self, keyframe_ids: IntArray, T_submap_kf: FloatArray, landmark_ids: IntArray, xyz_mu: FloatArray
     ) -> None:
-        """Take refined poses and points over; those of keyframes that were culled since are passed over."""
+        """Take refined poses and points over; those of keyframes that were culled since are passed over.
+
+        The distances at which landmarks were described grow with the map: these say how large their patches appear.
+        """
+        lm = self.landmarks
+        first, at = np.unique(lm["first_kf"][landmark_ids], return_inverse=True)
+        before = lm["xyz_mu"][landmark_ids] - self._centres(first)[at]
         for k, T in zip(keyframe_ids.tolist(), T_submap_kf, strict=True):
             if k in self.keyframes:
                 self.T_submap_kf[k] = np.array(T)
-        self.landmarks["xyz_mu"][landmark_ids] = xyz_mu
+        lm["xyz_mu"][landmark_ids] = xyz_mu
+        after = xyz_mu - self._centres(first)[at]
+        growth2 = np.einsum("ij,ij->i", after, after) / np.maximum(np.einsum("ij,ij->i", before, before), 1e-24)
+        lm["distance_mu"][landmark_ids] *= np.where(np.isfinite(growth2), np.sqrt(growth2), 1.0)
+
+    def _centres(self, keyframe_ids: IntArray) -> FloatArray:
+        """Return (K, 3) where keyframes stand, culled ones too; NaN for those of another submap."""
+        centres = np.full((len(keyframe_ids), 3), np.nan)
+        for row, k in enumerate(keyframe_ids.tolist()):
+            if k in self.T_submap_kf:
+                centres[row] = self.T_submap_kf[k][:3, 3]
+            elif k in self.anchors:
+                centres[row] = self.resolve_anchor(k, np.eye(4))[:3, 3]
+        return centres
 
     def copy(self) -> Submap:
         """Return an independent copy (keyframes and features are immutable and shared)."""

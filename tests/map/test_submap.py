@@ -57,6 +57,18 @@ class TestSubmap:
         assert list(submap.T_submap_kf) == [10, 30]
         np.testing.assert_allclose(submap.resolve_anchor(20, np.eye(4)), T[1], atol=1e-12)
 
+    def test_patches_appear_as_large_as_before_in_a_map_that_has_grown(self, submap: Submap) -> None:
+        """The distances at which landmarks were described follow an estimate."""
+        lm, ids, distance = submap.landmarks, np.arange(5), submap.landmarks["distance_mu"].copy()
+        lm["first_kf"][:] = [10, 10, 20, 20, 99]  # 99: in another submap
+        submap.remove_keyframe(20, 30)
+        T = submap.keyframe_poses([10, 30])
+        T[:, :3, 3] *= 3.0
+        submap.apply_estimate(np.array([10, 30]), T, ids, 3.0 * lm["xyz_mu"])
+        np.testing.assert_allclose(lm["distance_mu"][:2], 3.0 * distance[:2])
+        assert lm["distance_mu"][2] > distance[2]  # by way of the keyframe that its own is anchored to
+        assert lm["distance_mu"][4] == distance[4]
+
     def test_of_a_start(self) -> None:
         T = path(3, np.array([0.2, 0, 0]), np.zeros(3))
         feature = np.array([[0, 1, 2], [0, -1, 2], [3, 4, 5]])
