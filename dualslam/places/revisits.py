@@ -6,6 +6,7 @@ do not. What is believed becomes a link, and the atlas does the rest.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass
 
@@ -81,6 +82,7 @@ class Revisits:
         self._believed: _Found | None = None  # waits for what the atlas needs to be solved with it
         self._closing: _Found | None = None  # the atlas is being solved with it
         self._n_asked = 0
+        self._asked_since: dict[int, int] = {}  # by submap, the first keyframe that was asked about while it was live
         self._rest = REST
         self._rests_until = 0  # counted in `_n_asked`; other maps may be found all the same
 
@@ -95,11 +97,16 @@ class Revisits:
         return self.sightings.take_in(live, at_most) if enabled else 0
 
     def note_keyframe(
-        self, live: VisualOdometry, at_most: int | None = None, among: Collection[int] | None = None
+        self,
+        live: VisualOdometry,
+        at_most: int | None = None,
+        among: Collection[int] | None = None,
+        of_other_run: bool = False,
     ) -> None:
         """Search for a place that the live map's reference keyframe shows again; `collect` returns the answer.
 
-        `at_most`: see `take_in`. `among`: the submaps to search, those of another run; by default all.
+        `at_most`: see `take_in`. `among`: the submaps to search; by default all. `of_other_run`: whether these are of
+        another run, whose keyframes are none that were tracked a moment ago.
         """
         if not (self._config.places.enabled and self._config.loops.enabled):
             return
@@ -113,15 +120,21 @@ class Revisits:
         submap, keyframe_id = live.submap, live.reference_id
         submaps = self._record.atlas.submaps
         if among is None:
+            self._asked_since.setdefault(submap.id, keyframe_id)
             self.take_in(submap, at_most)
         else:
             for m in among:
                 self._recogniser.take_in(submaps[m])
         features = submap.keyframes[keyframe_id].features
-        candidates = tuple(self._recogniser.query(features, submaps, self._may_be(submap, keyframe_id, among)))
+        may_be = self._may_be(submap, keyframe_id, among, of_other_run)
+        candidates = tuple(self._recogniser.query(features, submaps, may_be))
         named = {submap.id, *(candidate.submap_id for candidate in candidates)} if candidates else set()
         search = PlaceSearch(submap.id, keyframe_id, candidates, {m: submaps[m].copy() for m in sorted(named)})
         self._desk.submit(JobKind.LOOP, search, of=submap.id)
+
+    def asked_since(self, submap_id: int) -> float:
+        """Return the keyframe of a submap from which on they were compared with earlier maps; infinity for none."""
+        return self._asked_since.get(submap_id, math.inf)
 
     def take_solution(self, live: VisualOdometry | None, now: FrameStamp) -> AtlasReport | None:
         """Let the maps follow what has been solved meanwhile.
@@ -189,13 +202,15 @@ class Revisits:
                 return None
         return best
 
-    def _may_be(self, submap: Submap, keyframe_id: int, among: Collection[int] | None) -> Callable[[int, int], bool]:
+    def _may_be(
+        self, submap: Submap, keyframe_id: int, among: Collection[int] | None, of_other_run: bool
+    ) -> Callable[[int, int], bool]:
         """Return which keyframes would be a revisit: not those that are tracked, or were a moment ago."""
         ids = submap.landmark_of[keyframe_id]
         seen_now = set(submap.covisible(ids[ids >= 0])[0].tolist())
         arrived = sorted({k for m in self._record.atlas.submaps.values() for k in m.keyframes})
         at = arrived.index(keyframe_id)
-        recent = {*arrived[max(at - RECENT, 0) : at + RECENT + 1], *seen_now} if among is None else set()
+        recent = {*arrived[max(at - RECENT, 0) : at + RECENT + 1], *seen_now} if not of_other_run else set()
         joined = set(self._record.atlas.component_of(submap.id))
         rests = self._n_asked < self._rests_until
 

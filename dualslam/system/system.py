@@ -80,7 +80,7 @@ class System:
         self.blank: set[int] = set()
         self._world = saved.main[0] if saved is not None and saved.main else None
         self._worlds = Worlds(record.atlas, self._world)
-        earlier = frozenset(record.atlas.submaps)
+        self._earlier = earlier = frozenset(record.atlas.submaps)
         self.atlas, self.rows, self.poses = record.atlas, record.rows, record.poses
         self.events, self.timer = record.events, record.timer
         self.buffer = FrameBuffer(config.buffer.duration_s, config.buffer.max_mb)
@@ -317,6 +317,8 @@ class System:
         self._graphs.finish(last)
         if state.live is not None and not state.localises:
             self._endings.archive(state.live, "end of sequence")
+        if last is not None and not interrupted and not state.localises:
+            self._places.join_rest(self.atlas.submaps.keys() - self._earlier, last)
         shapes = {} if interrupted or state.localises else self._endings.refine()
         if last is not None:
             self._connections.settle(last)

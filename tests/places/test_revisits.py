@@ -16,6 +16,7 @@ from dualslam.core.types import Failure, FailureReason, FloatArray, FrameStatus
 from dualslam.linking.join_test import drift_gate
 from dualslam.places.recogniser import PlaceSearch
 from dualslam.run.results import trajectories_of
+from dualslam.system.places import PlaceKeeping
 from dualslam.system.system import System
 from dualslam.testing.late_desk import LateDesk
 from dualslam.testing.point_world import PointWorld, pose_errors, system_in
@@ -137,6 +138,18 @@ def test_maps_that_share_no_frame_are_merged_by_sight() -> None:
     assert main.index[-1] == N + 11
     size = np.linalg.norm(np.ptp(ring(N)[:, :3, 3], axis=0))
     assert pose_errors(main.T_world_cam, ring(N + 12)[main.index])[0].max() < 0.05 * size
+
+
+@pytest.mark.slow
+def test_maps_that_are_apart_at_the_end_are_compared_once_more(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each was asked about places while it was live, of which nothing came here."""
+    monkeypatch.setattr(PlaceKeeping, "note_keyframe", lambda *_: None)
+    system = two_maps()
+    assert system.atlas.components() == [[0], [1]]
+    system.finish()
+    assert [e.frame for e in system.events.of_kind(EventKind.MERGED)] == [N + 11]
+    assert system.atlas.components() == [[0, 1]]
+    assert pose_errors(trajectories_of(system).main.T_world_cam, ring(N + 12)[[*system.poses]])[0].max() < 0.2
 
 
 @pytest.mark.slow
