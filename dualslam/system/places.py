@@ -122,11 +122,8 @@ class PlaceKeeping:
                 continue
             asking.start_at(k)
             with state.record.timer.measure("places"):
-                self._revisits.take_solution(asking, now)
                 self._revisits.note_keyframe(asking, among=among[k], of_other_run=of_other_run)
-                self._revisits.collect(asking, now)
-        with state.record.timer.measure("places"):
-            self._revisits.finish(asking, now)
+                self._revisits.finish(asking, now)
 
     # --- a place that an earlier run has mapped
 
