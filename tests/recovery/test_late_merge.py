@@ -281,7 +281,7 @@ def test_the_lost_map_has_been_found_again_meanwhile(world: PointWorld, again: b
 
 def test_a_link_that_leaps_must_hold_anew(world: PointWorld, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("dualslam.recovery.manager.judge_motion", lambda _: LEAP)
-    monkeypatch.setattr("dualslam.linking.link_tries.tightened", lambda *_: 0.0)  # sure as it may be, it holds twice
+    monkeypatch.setattr("dualslam.recovery.schedule.tightened", lambda *_: 0.0)  # sure as it may be, it holds twice
     system, frames = late_system(world, 12), iter(world.frames())
     tries = system._recoveries._tries
     tries.refused[0] = 1
