@@ -118,7 +118,7 @@ def test_it_counts_beside_what_else_is_unknown(link: LinkEstimate) -> None:
 def test_of_a_large_map_a_window_is_asked_that_reaches_both_ends(
     link: LinkEstimate, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("dualslam.linking.camera_bend.MAX_KEYFRAMES", 12)
+    monkeypatch.setattr("dualslam.linking.live_end.MAX_KEYFRAMES", 12)
     asked: list[IntArray] = []
 
     def find(submap: Submap, ids: IntArray) -> PreferredCamera | None:
