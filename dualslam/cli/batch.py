@@ -17,11 +17,10 @@ from dualslam.io.atomic import write_text
 from dualslam.io.run_folder import SUMMARY
 from dualslam.io.run_reading import read_summary
 from dualslam.report.compare import distinct_names
+from dualslam.run.judgement import MIN_COVERAGE
 
 TABLE = "runs.csv"
 COLUMNS = ("run", "frames", "coverage", "submaps", "verdict", "reasons")
-WHOLE = 0.95
-"""Coverage from which a run counts as whole: the first frames and the last may lie outside the map."""
 FOR_ONE_SOURCE = ("replay", "live", "measurements")
 
 
@@ -50,18 +49,21 @@ def run_all(args: argparse.Namespace, run_one: Callable[[argparse.Namespace], in
         status = max(status, one)
         if one == exit_status.INTERRUPTED:
             break
-    rows = [_row(name, out, errors.get(name, "not run")) for name, out in outs.items()]
-    write_text(Path(args.out) / TABLE, _as_csv(rows))
-    n_whole = sum(_is_whole(row) for row in rows)
-    words = [[_worded(row[key]) for key in COLUMNS] for row in rows]
-    _say(args, table_text([list(COLUMNS), *words]))
-    _say(
-        args, f"{n_whole} of {len(rows)} are whole: {100 * WHOLE:.0f} % of the frames in one map, and no doubt about it"
-    )
-    if n_whole < len(rows):
-        _say(args, f"look at: {', '.join(str(row['run']) for row in rows if not _is_whole(row))}")
-    _say(args, f"table in {Path(args.out) / TABLE}")
+    _conclude(args, [_row(name, out, errors.get(name, "not run")) for name, out in outs.items()])
     return status
+
+
+def _conclude(args: argparse.Namespace, rows: Sequence[dict[str, Any]]) -> None:
+    """Print the table, and write it."""
+    missing = [str(row["run"]) for row in rows if not _is_whole(row)]
+    whole = f"{100 * MIN_COVERAGE:.0f} % of the frames in the main map, not doubtful"
+    _say(args, table_text([list(COLUMNS), *([_worded(row[key]) for key in COLUMNS] for row in rows)]))
+    _say(args, f"{len(rows) - len(missing)} of {len(rows)} are whole: {whole}")
+    if missing:
+        _say(args, f"look at: {', '.join(missing)}")
+    file = Path(args.out) / TABLE
+    write_text(file, _as_csv(rows))
+    _say(args, f"table in {file}")
 
 
 def _folders(sources: Sequence[str], parent: Path) -> dict[str, Path]:
@@ -84,13 +86,14 @@ def _row(name: str, out: Path, missing: str) -> dict[str, Any]:
     if not (out / SUMMARY).exists():
         return dict.fromkeys(COLUMNS, "") | {"run": name, "reasons": missing}
     summary = read_summary(out)
-    reasons = [reason["code"] for reason in summary["verdict"]["reasons"]] or ["no map"] * (not summary["posed"])
-    values = summary["frames"], summary["coverage"], summary["submaps"], summary["verdict"]["level"], ", ".join(reasons)
-    return dict(zip(COLUMNS, (name, *values), strict=True))
+    verdict = summary.get("verdict") or {"level": "-", "reasons": []}  # of an earlier version
+    reasons = ", ".join(reason["code"] for reason in verdict["reasons"])
+    values = name, summary["frames"], summary["coverage"], summary["submaps"], verdict["level"], reasons
+    return dict(zip(COLUMNS, values, strict=True))
 
 
 def _is_whole(row: dict[str, Any]) -> bool:
-    return bool(row["coverage"] != "" and row["coverage"] >= WHOLE and row["verdict"] != "doubtful")
+    return bool(row["coverage"] != "" and row["coverage"] >= MIN_COVERAGE and row["verdict"] != "doubtful")
 
 
 def _worded(value: Any) -> str:
