@@ -90,13 +90,15 @@ class Refinder:
     Attributes
     ----------
     images : KeyframeImages
+    camera : callable
+        The camera that rectifies the features now.
 
     Parameters
     ----------
     frontend : Frontend
         The live one.
     camera : callable
-        The camera that rectifies the features now.
+        See above.
     model_sigma_px : float
         Error of its model, see `CameraConfig.model_sigma_px`.
     """
@@ -104,7 +106,7 @@ class Refinder:
     def __init__(self, submap: Submap, frontend: Frontend, camera: Callable[[], Camera], model_sigma_px: float) -> None:
         self._submap = submap
         self._frontend = frontend
-        self._camera = camera
+        self.camera = camera
         self._model_sigma_px = model_sigma_px
         self.images = KeyframeImages()
         self._rim: list[int] = []
@@ -209,7 +211,7 @@ class Refinder:
 
     def _find(self, sought: _Sought, track: Track, levels: Pyramid) -> _Found:
         """Search the image for one keyframe's landmarks."""
-        camera = self._camera()
+        camera = self.camera()
         T_kf_submap = se3.inverse(self._submap.T_submap_kf[sought.keyframe_id])
         T_cam_kf = track.T_cam_submap @ self._submap.T_submap_kf[sought.keyframe_id]
         uv_kf = sought.features.uv_px

@@ -21,6 +21,7 @@ from dualslam.frontends.gap.refinding import Refinder
 from dualslam.frontends.gap.uncertainty import track_uncertainty
 from dualslam.frontends.tracking.keyframing import keyframe_due, keyframe_like, passes_unmapped
 from dualslam.frontends.tracking.mapper import Mapper
+from dualslam.frontends.tracking.patch_alignment import PatchAlignment
 from dualslam.frontends.tracking.pixel_search import PixelSearch
 from dualslam.frontends.tracking.tracker import GivenPose, Tracker
 from dualslam.map.anchors import RelativePose
@@ -78,6 +79,7 @@ class VisualFrontEnd:
         self._mapper = Mapper(frontend, config.mapping, submap, camera)
         self._refinder = refinder
         self._window = window
+        self._alignment = None if refinder is None else PatchAlignment(refinder.images, refinder.camera)
         self._first_id = first_id
         self._careful = True  # the next keyframe is the graph's to pose
         self._after_gap = False
@@ -266,6 +268,7 @@ class VisualFrontEnd:
             self.submap.relative_poses[track.view.index] = known
         track = self._refound(track, pose_is_given)
         self._mapper.observe(track)
+        self._align(self._rows_of(track.view.index))
         matched = self._rows_of(track.view.index)
         rebuild = self._rebuild_due(track)
         posed = self._pose(track, len(matched), pose_is_given)
@@ -274,13 +277,25 @@ class VisualFrontEnd:
             self._withdraw(track.view.index)
             detail = f"the map contradicts {n_refused} of {len(matched)} matches of keyframe {track.view.index}"
             return Failure(FailureReason.CHI_SQUARE, detail, {"n_refused": float(n_refused)})
-        self._mapper.grow(track, self._apart, posed.noise2)
+        self._grow(track, posed.noise2)
         grown = self._solve(rebuild)
         self._meet(track.view.index)
         self._cull_keyframe()
         self._tracker.refresh()
         failed = posed.rebuilt or (grown.rebuilt and not rebuild)
         return KeyframeReport(posed, grown, failed)
+
+    def _grow(self, track: Track, noise2: float) -> None:
+        """Grow the map about a keyframe, and align what it observes more by that."""
+        n_before = len(self.submap.observations)
+        self._mapper.grow(track, self._apart, noise2)
+        rows = np.arange(n_before, len(self.submap.observations))
+        self._align(rows[self.submap.observations["alive"][rows]])
+
+    def _align(self, rows: IntArray) -> None:
+        """Align observations with older ones of their landmarks, where images are kept."""
+        if self._alignment is not None:
+            self._alignment.refine(self.submap, rows)
 
     def _pose(self, track: Track, n_matched: int, pose_is_given: bool) -> GraphEstimate:
         """Pose the new keyframe, and drop what contradicts it."""

@@ -1,0 +1,85 @@
+"""Noisy observations of a plane move to where it is seen; wrong ones are removed, unless the image is blurred."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from dualslam.core.geometry import se3
+from dualslam.core.grey_image import GreyImage
+from dualslam.core.types import FloatArray, Keyframe
+from dualslam.frontends.tracking.keyframe_images import KeyframeImages
+from dualslam.frontends.tracking.patch_alignment import PatchAlignment
+from dualslam.map.submap import Submap
+from tests.frontends.direct.test_warp import CAMERA, T_CAM_KF, lift, views
+
+WRONG = slice(60, 80)
+"""Rows of the grid in the middle of the image."""
+
+
+def seen_twice(noise_px: float, blur_px: float = 0.0) -> tuple[Submap, PatchAlignment, FloatArray]:
+    """Return a map whose second keyframe sees a plane with noise and some wrong matches, and the true pixels."""
+    first, second, submap = views()
+    truth = CAMERA.project(lift(first.features.uv_px) @ T_CAM_KF[:3, :3].T + T_CAM_KF[:3, 3])
+    uv = truth + np.random.default_rng(0).normal(0.0, noise_px, truth.shape)
+    uv[WRONG] += 25.0
+    features = replace(second.features, uv_px=uv, uv_rect_px=uv)
+    submap.add_keyframe(Keyframe(30, 1.0, features), se3.inverse(T_CAM_KF))
+    row = np.arange(len(uv))
+    submap.add_observations(30, row, row)
+    images = KeyframeImages()
+    assert second.image is not None
+    image = blurred(second.image.pixels(), blur_px)
+    images.remember(first)
+    images.remember(replace(second, features=features, image=GreyImage.of(image)))
+    return submap, PatchAlignment(images, lambda: CAMERA), truth
+
+
+def blurred(image: NDArray[np.uint8], sigma_px: float) -> NDArray[np.uint8]:
+    """Blur an image; not at all by 0."""
+    return np.asarray(cv2.GaussianBlur(image, (0, 0), sigma_px), np.uint8) if sigma_px else image
+
+
+def errors(submap: Submap, truth: FloatArray) -> FloatArray:
+    """Return how far the second keyframe's features are from the truth, pixels."""
+    return np.asarray(np.linalg.norm(submap.keyframes[30].features.uv_rect_px - truth, axis=1))
+
+
+def rows_of(submap: Submap, k: int) -> NDArray[np.int64]:
+    """Return the live observations of a keyframe."""
+    return np.flatnonzero((submap.observations["kf"] == k) & submap.observations["alive"])
+
+
+def test_pixels_move_to_where_the_patches_match() -> None:
+    submap, alignment, truth = seen_twice(noise_px=0.4)
+    reference, was_px, before = submap.keyframes[0].features, submap.keyframes[30].features.uv_px, errors(submap, truth)
+    alignment.refine(submap, rows_of(submap, 30))
+    is_moved = (submap.keyframes[30].features.uv_px != was_px).any(axis=1)
+    assert is_moved.sum() > 60
+    assert np.median(errors(submap, truth)[is_moved]) < 0.3 * np.median(before[is_moved])
+    assert submap.keyframes[0].features is reference
+
+
+def test_wrong_matches_are_removed() -> None:
+    submap, alignment, _ = seen_twice(noise_px=0.2)
+    alignment.refine(submap, rows_of(submap, 30))
+    is_seen = submap.landmark_of[30] >= 0
+    assert is_seen[WRONG].mean() < 0.3  # those left are of edges, or of little contrast
+    assert np.delete(is_seen, WRONG).mean() > 0.9
+
+
+def test_a_blurred_image_contradicts_nothing() -> None:
+    submap, alignment, _ = seen_twice(noise_px=0.2, blur_px=8.0)
+    alignment.refine(submap, rows_of(submap, 30))
+    assert (submap.landmark_of[30] >= 0).all()
+
+
+def test_observations_without_an_image_stay_as_they_are() -> None:
+    submap, _, _ = seen_twice(noise_px=0.4)
+    before = submap.keyframes[30].features
+    PatchAlignment(KeyframeImages(), lambda: CAMERA).refine(submap, rows_of(submap, 30))
+    assert submap.keyframes[30].features is before
+    assert (submap.landmark_of[30] >= 0).all()
