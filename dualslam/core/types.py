@@ -148,12 +148,18 @@ class Features:
     def n_common(self, other: Features) -> int:
         """Return how many features, from the first on, are the same in another set of the same image.
 
-        A map may have found more in its keyframe than the front end had: those stand behind the front end's.
+        A map may have found more in its keyframe than the front end had: those stand behind the front end's. It may also
+        have refined pixels, so that descriptors tell.
         """
         n = min(len(self), len(other))
         if self is other:
             return n
-        differ = (self.uv_px[:n] != other.uv_px[:n]).any(axis=1)
+        if (
+            self.descriptors.dtype != other.descriptors.dtype
+            or self.descriptors.shape[1:] != other.descriptors.shape[1:]
+        ):
+            return 0
+        differ = (self.octave[:n] != other.octave[:n]) | (self.descriptors[:n] != other.descriptors[:n]).any(axis=1)
         return int(differ.argmax()) if differ.any() else n
 
     def take(self, rows: NDArray[np.generic]) -> Features:

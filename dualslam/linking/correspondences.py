@@ -150,22 +150,11 @@ def place_pairs(old: Submap, new: Submap, matched: MatchedLandmarks, old_before:
     )
 
 
-def _n_same_features(a: Features, b: Features) -> int:
-    """Return how many features, from the first on, two sets share, perhaps copied by a trip through another process."""
-    n = a.n_common(b)
-    same = a is b or (
-        a.descriptors.dtype == b.descriptors.dtype
-        and np.array_equal(a.uv_rect_px[:n], b.uv_rect_px[:n])
-        and np.array_equal(a.descriptors[:n], b.descriptors[:n])
-    )
-    return n if same else 0
-
-
 def _votes_of_keyframe(old: Submap, new: Submap, k: int, matcher: DescriptorMatcher | None) -> _Votes:
     """Propose pairs in one shared keyframe: by identity, then by descriptor among what is left."""
     in_old, in_new = old.landmark_of[k], new.landmark_of[k]
     features_old, features_new = old.keyframes[k].features, new.keyframes[k].features
-    n_same = _n_same_features(features_old, features_new)
+    n_same = features_old.n_common(features_new)
     same = np.flatnonzero((in_old[:n_same] >= 0) & (in_new[:n_same] >= 0))
     rest_old, rest_new = np.flatnonzero(in_old >= 0), np.flatnonzero(in_new >= 0)
     if len(same):
