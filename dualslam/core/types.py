@@ -148,8 +148,8 @@ class Features:
     def n_common(self, other: Features) -> int:
         """Return how many features, from the first on, are the same in another set of the same image.
 
-        A map may have found more in its keyframe than the front end had: those stand behind the front end's. It may also
-        have refined pixels, so that descriptors tell.
+        A map may have found more in its keyframe than the front end had: those stand behind the front end's. It may
+        have refined pixels, too. So descriptors tell.
         """
         n = min(len(self), len(other))
         if self is other:
@@ -159,7 +159,7 @@ class Features:
             or self.descriptors.shape[1:] != other.descriptors.shape[1:]
         ):
             return 0
-        differ = (self.octave[:n] != other.octave[:n]) | (self.descriptors[:n] != other.descriptors[:n]).any(axis=1)
+        differ = (self.octave[:n] != other.octave[:n]) | (mine[:n] != theirs[:n]).any(axis=1)
         return int(differ.argmax()) if differ.any() else n
 
     def take(self, rows: NDArray[np.generic]) -> Features:
