@@ -154,10 +154,8 @@ class Features:
         n = min(len(self), len(other))
         if self is other:
             return n
-        if (
-            self.descriptors.dtype != other.descriptors.dtype
-            or self.descriptors.shape[1:] != other.descriptors.shape[1:]
-        ):
+        mine, theirs = self.descriptors, other.descriptors
+        if (mine.dtype, mine.shape[1:]) != (theirs.dtype, theirs.shape[1:]):
             return 0
         differ = (self.octave[:n] != other.octave[:n]) | (mine[:n] != theirs[:n]).any(axis=1)
         return int(differ.argmax()) if differ.any() else n
