@@ -2,10 +2,10 @@
 
 python benchmarks/gripper.py --out runs/gripper --first 100 --demonstrations 20 [--no-mask] [--keep]
 
-A hand holds the gripper over a laid table, reaches for a thing, closes the fingers, carries the thing to another place,
-opens them and moves back. The wrist turns and trembles, and images are blurred. What is carried moves with the camera,
-and is in no mask. A demonstration is whole if 95 % of its frames have a pose in one map. It is right if each position
-is within 5 % of the path's length of the truth, aligned by a similarity.
+A hand holds the gripper over a laid table, and reaches for a thing. It closes the fingers, carries the thing to
+another place, opens them and moves back. The wrist turns and trembles, and images are blurred. What is carried moves
+with the camera, and is in no mask. A demonstration is whole if 95 % of its frames have a pose in one map. It is right
+if each position is within 5 % of the path's length of the truth, aligned by a similarity.
 """
 
 from __future__ import annotations

@@ -205,7 +205,7 @@ class View:
 
 @dataclass(frozen=True, slots=True)
 class LateFrame:
-    """A frame that came too late to be tracked: its features are found by whoever comes to need them.
+    """A frame that came too late to be tracked, and whose features are found only when a walk needs them.
 
     `image`: without the pixels that show no scene.
     """

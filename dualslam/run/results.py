@@ -84,7 +84,7 @@ def frame_rows(
     main : Trajectory, optional
         That of `trajectories_of`, if it is there already.
     latencies_ms : mapping of int to float, optional
-        Of the frames that were looked at, by their index, as the harness measured them; else the time of their steps.
+        Of the frames that were tracked, by their index, as the harness measured them. Else that of their steps.
     """
     in_main = set((trajectories_of(system).main if main is None else main).index.tolist())
     claims = {m: claims_of(submap) for m, submap in system.atlas.submaps.items()}
