@@ -25,6 +25,8 @@ from dualslam.core.grey_image import GreyImage
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
+REFINED_PX = 1.5
+"""Pixels of its octave by which a detector errs at most, and a map may move a feature: a longer way leads elsewhere."""
 
 
 class FrameStatus(StrEnum):
@@ -149,7 +151,7 @@ class Features:
         """Return how many features, from the first on, are the same in another set of the same image.
 
         A map may have found more in its keyframe than the front end had: those stand behind the front end's. It may
-        have refined pixels, too. So descriptors tell.
+        have refined pixels, too (`REFINED_PX`). So descriptors and octaves are compared, and pixels roughly.
         """
         n = min(len(self), len(other))
         if self is other:
@@ -157,7 +159,9 @@ class Features:
         mine, theirs = self.descriptors, other.descriptors
         if (mine.dtype, mine.shape[1:]) != (theirs.dtype, theirs.shape[1:]):
             return 0
-        differ = (self.octave[:n] != other.octave[:n]) | (mine[:n] != theirs[:n]).any(axis=1)
+        apart_px = np.abs(self.uv_px[:n] - other.uv_px[:n]).max(axis=1, initial=0.0)
+        differ = (self.octave[:n] != other.octave[:n]) | (apart_px > 2 * REFINED_PX * self.scale[:n])
+        differ |= (mine[:n] != theirs[:n]).any(axis=1)
         return int(differ.argmax()) if differ.any() else n
 
     def take(self, rows: NDArray[np.generic]) -> Features:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from dualslam.core.camera.base import Camera
 from dualslam.core.geometry import se3
-from dualslam.core.types import BoolArray, FloatArray, IntArray
+from dualslam.core.types import REFINED_PX, BoolArray, FloatArray, IntArray
 from dualslam.frontends.direct.warp import Pyramid, build_pyramid, correlate, inside, sample
 from dualslam.frontends.tracking.keyframe_images import KeyframeImages
 from dualslam.frontends.tracking.row_shifts import find_as_read
@@ -29,8 +29,6 @@ MIN_CONTRAST = 3.0
 """Standard deviation of a patch's grey values: less is noise."""
 MAX_CONDITION = 100.0
 """Ratio of a patch's gradients across and along an edge (squared): above, the edge leaves one direction open."""
-MAX_SHIFT = 1.5
-"""Pixels of the octave by which a detector errs at most: a longer way leads to another minimum."""
 CONVERGED = 0.1
 """Last step in pixels of the patch."""
 AGREES = 0.85
@@ -145,7 +143,7 @@ class PatchAlignment:
         usable = inside(uv_there, steps, HALF + 1, camera.size_px) & np.isfinite(axes).all(axis=(1, 2))
         usable[usable] = inside(uv[usable], axes[usable], HALF, camera.size_px)
         own_scale = submap.keyframes[k].features.scale[feature]
-        return _align(templates, self._levels(k), uv, axes, usable, MAX_SHIFT * own_scale)
+        return _align(templates, self._levels(k), uv, axes, usable, REFINED_PX * own_scale)
 
     def _templates(self, k: int, feature: IntArray, uv_px: FloatArray, scale: FloatArray) -> NDArray[np.float32]:
         """Return patches about features of a keyframe, in their octaves; each is sampled once."""
