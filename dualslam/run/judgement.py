@@ -31,7 +31,8 @@ MAX_FOCAL_SIGMA = 0.03
 """Standard deviation of the logarithm of the focal length."""
 MIN_FOCAL_CHANGE, MAX_FOCAL_SIGMAS = 0.1, 4.0
 """Of the logarithm of the focal length against the one that the map was made with until then: two sigmas of what a
-data sheet is off. Its own sigma is that of one submap. Of 44 answers on 7-Scenes 1 % are 3.7 sigmas from their median.
+data sheet is off, and known to be more. Its own sigma is that of one submap: of 44 answers on 7-Scenes 1 % are 3.7
+sigmas from their median.
 """
 STOOD_S = 1.0
 """For so long at least a camera has stood when it is found to: seven images, a fifth of a second apart, show it."""
@@ -283,7 +284,7 @@ def _camera(system: System, told: Sequence[_CameraAnswer], rows: Sequence[FrameR
         check = "Check that the calibration is of this camera, lens and image size."
         is_beyond = told[-1].prior_sigmas > MAX_PRIOR_SIGMAS
         level = Level.DOUBTFUL if is_beyond else Level.USABLE
-        far = [a for a in told if abs(a.change) > max(MIN_FOCAL_CHANGE, MAX_FOCAL_SIGMAS * a.sigma)]
+        far = [a for a in told if abs(a.change) > MIN_FOCAL_CHANGE + MAX_FOCAL_SIGMAS * a.sigma]
         if far:
             apart = far[-1].log_focal
             share = f"{100 * abs(np.expm1(apart)):.0f} % {'longer' if apart > 0 else 'shorter'}"

@@ -136,6 +136,7 @@ def test_a_focal_length_far_from_the_one_used_is_told(log_focal: float, level: L
         ([-0.2], Level.USABLE),
         ([-0.2, -0.21], Level.USABLE),
         ([-0.08, -0.104], Level.GOOD),  # 7-Scenes, whose calibration is off by as much
+        ([-0.104, -0.109], Level.GOOD),  # not known to be more than a tenth
     ],
 )
 @pytest.mark.parametrize("last", [EventKind.CALIBRATED, EventKind.CALIBRATION_KEPT])
