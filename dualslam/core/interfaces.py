@@ -398,8 +398,8 @@ class VisualOdometry(Protocol):
         """Go by the keyframe that is there already, of an earlier run, for a frame which would have become one."""
         ...
 
-    def insert_keyframe(self, track: Track) -> KeyframeReport | Failure:
-        """Make the frame a keyframe and solve the graph."""
+    def insert_keyframe(self, track: Track, in_haste: bool = False) -> KeyframeReport | Failure:
+        """Make the frame a keyframe and solve the graph; `in_haste`: without what can be left out."""
         ...
 
 

@@ -103,7 +103,7 @@ class Tracking:
         state, record = self._state, self._state.record
         try:
             with record.timer.measure("mapping"):
-                report = odometry.insert_keyframe(track)
+                report = odometry.insert_keyframe(track, in_haste=state.pace.behind)
         except SolverError as error:
             return Failure(FailureReason.SOLVER, str(error))
         state.health.note_keyframe(report)

@@ -122,9 +122,9 @@ class PnpOdometry:
         """Go by the keyframe of an earlier run that is there for a frame which would have become one."""
         self._live.go_by_known(track)
 
-    def insert_keyframe(self, track: Track) -> KeyframeReport | Failure:
+    def insert_keyframe(self, track: Track, in_haste: bool = False) -> KeyframeReport | Failure:
         """Make the frame a keyframe and solve the graph."""
-        report = self._live.insert_keyframe(track, pose_is_given=track.view.index == self._relocalised)
+        report = self._live.insert_keyframe(track, in_haste, pose_is_given=track.view.index == self._relocalised)
         if isinstance(report, Failure):
             return report
         self._note(track.view, track.view.index, se3.inverse(self.submap.T_submap_kf[track.view.index]))

@@ -253,10 +253,13 @@ class VisualFrontEnd:
         """Return the keyframe of an earlier run that shows the same."""
         return keyframe_like(track, self.submap, self._first_id, self._config.keyframes) if self._first_id else None
 
-    def insert_keyframe(self, track: Track, pose_is_given: bool = False) -> KeyframeReport | Failure:
+    def insert_keyframe(
+        self, track: Track, in_haste: bool = False, pose_is_given: bool = False
+    ) -> KeyframeReport | Failure:
         """Make the frame a keyframe: pose it by its matches, extend the map from there, solve.
 
-        `pose_is_given`: its pose and covariance come from elsewhere, and count beside the landmarks that it sees.
+        `in_haste`: no patches are aligned. `pose_is_given`: its pose and covariance come from elsewhere, and count
+        beside the landmarks that it sees.
 
         What a pose places, it places to its own liking: new landmarks of a wrong one confirm it, and outvote the old
         ones in the next frames. The keyframe is therefore posed by its matches before any is made: by a window of its
@@ -268,7 +271,8 @@ class VisualFrontEnd:
             self.submap.relative_poses[track.view.index] = known
         track = self._refound(track, pose_is_given)
         self._mapper.observe(track)
-        self._align(self._rows_of(track.view.index))
+        if not in_haste:
+            self._align(self._rows_of(track.view.index))
         matched = self._rows_of(track.view.index)
         rebuild = self._rebuild_due(track)
         posed = self._pose(track, len(matched), pose_is_given)
@@ -277,20 +281,17 @@ class VisualFrontEnd:
             self._withdraw(track.view.index)
             detail = f"the map contradicts {n_refused} of {len(matched)} matches of keyframe {track.view.index}"
             return Failure(FailureReason.CHI_SQUARE, detail, {"n_refused": float(n_refused)})
-        self._grow(track, posed.noise2)
+        n_before = len(self.submap.observations)
+        self._mapper.grow(track, self._apart, posed.noise2)
+        if not in_haste:
+            grown_rows = np.arange(n_before, len(self.submap.observations))
+            self._align(grown_rows[self.submap.observations["alive"][grown_rows]])
         grown = self._solve(rebuild)
         self._meet(track.view.index)
         self._cull_keyframe()
         self._tracker.refresh()
         failed = posed.rebuilt or (grown.rebuilt and not rebuild)
         return KeyframeReport(posed, grown, failed)
-
-    def _grow(self, track: Track, noise2: float) -> None:
-        """Grow the map about a keyframe, and align what it observes more by that."""
-        n_before = len(self.submap.observations)
-        self._mapper.grow(track, self._apart, noise2)
-        rows = np.arange(n_before, len(self.submap.observations))
-        self._align(rows[self.submap.observations["alive"][rows]])
 
     def _align(self, rows: IntArray) -> None:
         """Align observations with older ones of their landmarks, where images are kept."""

@@ -132,10 +132,10 @@ class _FaultyOdometry:
             return Ruling(True, detail="the failure lab wants it")
         return self._inner.keyframe_due(track)
 
-    def insert_keyframe(self, track: Track) -> KeyframeReport | Failure:
+    def insert_keyframe(self, track: Track, in_haste: bool = False) -> KeyframeReport | Failure:
         if self._script.solver_fails(track.view.timestamp_s):
             raise SolverError(f"frame {track.view.index}: the failure lab lets the solver fail here")
-        return self._inner.insert_keyframe(track)
+        return self._inner.insert_keyframe(track, in_haste)
 
 
 def wrong_pose(track: Track, submap: Submap, fault: Corruption) -> FloatArray:

@@ -269,6 +269,16 @@ class TestMapping:
         live.grow_weak_start(noise2=1.0)
         assert len(live.submap.landmarks) == n_before
 
+    @pytest.mark.parametrize(("in_haste", "n_calls"), [(False, 2), (True, 0)])
+    def test_a_keyframe_in_haste_aligns_no_patches(self, world: PointWorld, in_haste: bool, n_calls: int) -> None:
+        live, aligned = front_end(world, [0, 4, 8], start_at=8), list[int]()
+        live._align = lambda rows: aligned.append(len(rows))  # type: ignore[method-assign]
+        for i in range(9, 16):
+            track = tracked(live, world.view(i))
+        live.insert_keyframe(track, in_haste)
+        assert len(aligned) == n_calls
+        assert all(n > 20 for n in aligned)
+
     def test_a_turn_towards_far_scenery_is_tracked_by_far_landmarks(self) -> None:
         """Nothing out there shows a degree of parallax before the near points are out of view."""
         rng = np.random.default_rng(3)
