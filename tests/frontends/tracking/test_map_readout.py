@@ -208,10 +208,12 @@ def test_keyframes_have_the_turn_that_their_poses_tell(monkeypatch: pytest.Monke
     turns: dict[int, FloatArray] = {}
     inserted = VisualFrontEnd.insert_keyframe
 
-    def noting(self: VisualFrontEnd, track: Track, pose_is_given: bool = False) -> KeyframeReport | Failure:
+    def noting(
+        self: VisualFrontEnd, track: Track, in_haste: bool = False, pose_is_given: bool = False
+    ) -> KeyframeReport | Failure:
         assert track.view.turn_rad is not None
         turns[track.view.index] = track.view.turn_rad
-        return inserted(self, track, pose_is_given)
+        return inserted(self, track, in_haste, pose_is_given)
 
     monkeypatch.setattr(VisualFrontEnd, "insert_keyframe", noting)
     run_of(world, 0.004, readout_s=0.004)
