@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+import numpy as np
+from numpy.typing import NDArray
+
 from dualslam.core.camera.base import Camera
 from dualslam.core.camera.rectification import rectify
 from dualslam.core.grey_image import GreyImage
@@ -47,11 +50,9 @@ class FrameReader:
 
     def keep(self, frame: Frame) -> LateFrame | Failure:
         """Return what is kept of a frame that came too late to be tracked: its image; a failure as above."""
-        if (unusable := _unusable(frame, self._camera())) is not None:
-            return unusable
-        assert frame.image is not None, "an image that is missing is unusable"
-        cover = self._scene.cover_of(frame)
-        image = frame.image if cover is None else cover.paint(frame.image)
+        image = _scene_in(frame, self._camera(), self._scene.cover_of(frame))
+        if isinstance(image, Failure):
+            return image
         return LateFrame(frame.index, frame.timestamp_s, GreyImage.of(to_grey(image)))
 
 
@@ -59,15 +60,22 @@ def view_of(
     frame: Frame, frontend: Frontend, camera: Camera, model_sigma_px: float, cover: Cover | None = None
 ) -> View | Failure:
     """Find a frame's features and take the lens distortion out of them; `cover` hides parts of its image."""
-    if (unusable := _unusable(frame, camera)) is not None:
-        return unusable
-    assert frame.image is not None, "an image that is missing is unusable"
-    image = frame.image if cover is None else cover.paint(frame.image)
+    image = _scene_in(frame, camera, cover)
+    if isinstance(image, Failure):
+        return image
     found = checked(frontend, frontend.extract(image) if frame.features is None else frame.features)
     if cover is not None:
         found = found.take(cover.shows(found))
     features = rectify(found, camera, model_sigma_px)
     return View(frame.index, frame.timestamp_s, features, GreyImage.of(to_grey(image)))
+
+
+def _scene_in(frame: Frame, camera: Camera, cover: Cover | None) -> NDArray[np.uint8] | Failure:
+    """Return a frame's image without what is covered."""
+    if (unusable := _unusable(frame, camera)) is not None:
+        return unusable
+    assert frame.image is not None, "an image that is missing is unusable"
+    return frame.image if cover is None else cover.paint(frame.image)
 
 
 def _unusable(frame: Frame, camera: Camera) -> Failure | None:
