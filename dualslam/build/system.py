@@ -219,7 +219,7 @@ def _camera_of(saved: StoredMap, camera: Camera) -> Camera:
     if saved.camera is None:
         return camera
     found = camera_for_map(saved.camera, camera)
-    if found is not saved.camera:
+    if found is not saved.camera and found is not camera:
         log.warning("the saved map was made with another camera: this one's pixels are brought to the map's")
     return found
 

@@ -33,7 +33,11 @@ N_POSED = 12
 TOLERANCE, N_SIGMAS = 0.01, 4.0
 """Of the log focal length: below the first, poses move by less than a hundredth of the depth, as a link's may. The
 second keeps frames of a flat scene from counting."""
+LOG_ZOOMS = tuple(round(0.1 * step, 1) for step in range(-7, 8))
+"""Factors on the focal length, from a half to two. Near the true one, frames match most points of the map. Far from it
+they match those that fit the wrong focal length, and these say that little is wrong."""
 N_TRIES = 6
+"""Refinements of the best factor: each takes the greater part of what is left."""
 N_ITERATIONS = 20
 HUBER = 2.0
 """Sigmas. The frames were matched by the wrong focal length, so that many residuals are larger."""
@@ -62,29 +66,43 @@ def camera_that_fits(config: Config, frames: Iterable[Frame], camera: Camera, sa
     if known is None:
         return camera
     config = config.with_section("recovery", workers=0)
-    tried, zoom = camera, 0.0
+    found = log_focal_of(_frames_in_map(config, frames, camera, load_atlas(saved_map)))
+    if found is None:
+        log.info("the saved map is not seen in the first frames: nothing tells whether their camera is right")
+        return camera
+    if _agrees(*found):
+        return camera
+
+    def seen_with(log_zoom: float) -> tuple[Camera, list[_Seen]]:
+        try:
+            tried = MappedCamera.of(zoomed(camera_for_map(known, camera), log_zoom), known.K)
+        except InputError:  # the lens was calibrated for a narrower view
+            return camera, []
+        return tried, _frames_in_map(config, frames, tried, load_atlas(saved_map))
+
+    zoom = max(LOG_ZOOMS, key=lambda log_zoom: sum(len(s.xyz) for s in seen_with(log_zoom)[1]))
     for _ in range(N_TRIES):
-        seen = _frames_in_map(config, frames, tried, load_atlas(saved_map))
+        tried, seen = seen_with(zoom)
         found = log_focal_of(seen)
         if found is None:
-            log.info("the saved map is not seen in the first frames: nothing tells whether their camera is right")
-            return camera
-        change, sigma = found
-        if abs(change) <= max(TOLERANCE, N_SIGMAS * sigma):
-            if zoom:
-                f = own_focal_px(camera)
-                log.warning(
-                    "the frames fit the saved map with a focal length of %.0f px, not %.0f: it is taken for theirs",
-                    f * math.exp(zoom),
-                    f,
-                )
+            break
+        if _agrees(*found):
+            f = own_focal_px(camera)
+            log.warning(
+                "the frames fit the saved map with a focal length of %.0f px, not %.0f: it is taken for theirs",
+                f * math.exp(zoom),
+                f,
+            )
             return tried
-        zoom += change
-        tried = MappedCamera.of(zoomed(camera_for_map(known, camera), zoom), known.K)
+        zoom += found[0]
     raise InputError(
         "The frames do not fit the saved map with any focal length: their camera is another one than "
         "they are said to be of; give its calibration (--camera)."
     )
+
+
+def _agrees(log_focal: float, sigma: float) -> bool:
+    return abs(log_focal) <= max(TOLERANCE, N_SIGMAS * sigma)
 
 
 def in_size_of_map(sequence: Sequence, saved_map: str | Path) -> Sequence:

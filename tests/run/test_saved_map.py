@@ -60,13 +60,14 @@ def test_a_run_on_a_saved_map_ends_with_all_its_pages(source: str, first: Path, 
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("zoom", [1.25, 1.5])
 def test_a_zoomed_camera_that_is_said_to_be_the_maps_is_found_out(
-    source: str, first: Path, caplog: pytest.LogCaptureFixture
+    source: str, first: Path, zoom: float, caplog: pytest.LogCaptureFixture
 ) -> None:
     """Its frames fit the map from farther off, metres wrong; the map's points tell the focal length."""
     config = Config.model_validate({"frontend": {"n_features": 500}})
     seen = open_source(source, start=20, max_frames=30)
-    zoom, (width, height) = 1.25, seen.camera.size_px
+    width, height = seen.camera.size_px
     shift = [0.5 * (1 - zoom) * (width - 1), 0.5 * (1 - zoom) * (height - 1)]
     A = np.array([[zoom, 0, shift[0]], [0, zoom, shift[1]]])
     frames = [replace(f, image=cv2.warpAffine(f.image, A, (width, height))) for f in seen]
