@@ -14,11 +14,13 @@ import struct
 import weakref
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from importlib.util import find_spec
 from pathlib import Path
 from tempfile import mkdtemp
 from typing import Any
 
 from dualslam.core.errors import InputError
+from dualslam.core.extras import how_to_install
 
 ROS1_MAGIC, MCAP_MAGIC, SQLITE_MAGIC = b"#ROSBAG V2.0\n", b"\x89MCAP0\r\n", b"SQLite format 3\0"
 
@@ -65,8 +67,10 @@ def is_bag(path: Path) -> bool:
 def scan(paths: list[Path]) -> Bag:
     """Find the messages of the files of a bag.
 
-    Raises `InputError` if one is no bag.
+    Raises `InputError` if one is no bag, or `rosbags` and what it unpacks by are not installed.
     """
+    if find_spec("rosbags") is None:
+        raise InputError(f"Bags are read by rosbags, which is not installed: {how_to_install('bags')}.")
     bag = Bag(paths)
     for number, path in enumerate(paths):
         if not is_bag(path):

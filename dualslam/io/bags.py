@@ -133,10 +133,8 @@ def _camera(bag: Bag, info: Topic, topic: Topic, where: str) -> Camera | None:
 
 def _message(data: bytes, topic: Topic) -> Any:
     """Return a message as the object that `rosbags` makes of it."""
-    try:
-        from rosbags.typesys import Stores, get_typestore
-    except ImportError:
-        raise InputError("Bags are read by rosbags, which is not installed: pip install 'dualslam[bags]'.") from None
+    from rosbags.typesys import Stores, get_typestore
+
     if topic.is_ros1:
         return get_typestore(Stores.ROS1_NOETIC).deserialize_ros1(data, topic.type)
     return get_typestore(Stores.ROS2_HUMBLE).deserialize_cdr(data, topic.type)

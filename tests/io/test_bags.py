@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -236,6 +237,14 @@ def test_what_is_no_bag_of_images_says_so(tmp_path: Path) -> None:
         open_sequence(path, fov_degrees=60)
     with pytest.raises(InputError, match="is no bag, and has no topics"):
         open_sequence(tmp_path / "text.txt", topic="/x")
+
+
+def test_without_the_extra_one_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = write_bag(tmp_path / "drive", "mcap_zstd", raw)  # packed by what the extra brings
+    for name in ("rosbags", "compression.zstd", "backports.zstd"):
+        monkeypatch.setitem(sys.modules, name, None)
+    with pytest.raises(InputError, match=r"^Bags are read by rosbags, which .*\[bags\]\"\.$"):
+        open_sequence(path)
 
 
 @pytest.mark.parametrize("share", [0.5, 0.7, 0.9])
