@@ -64,7 +64,9 @@ SUSPECT_NUMBER = re.compile(
     r"^(k|p|s|b|d|sx|sy|tau|r|inv|c)\d$|^(k|d|f|s|c|xi|alpha|beta|gamma|omega)$|^[fc][xy]$|^fl[xy]$"
 )
 """Names that look like a coefficient where they have one number."""
-HARMLESS = re.compile(r"^(sensortype|calibrationtime|focallengthmm|rectificationmatrix|projectionmatrix)$")
+HARMLESS = re.compile(
+    r"^(sensortype|calibrationtime|focallengthmm|rectificationmatrix|projectionmatrix|perframeintrinsiccoeffs)$"
+)
 RIG = re.compile(r"^(left|right|camera[12]?|cam\d+|frames|value0)$")
 """Where a file has several cameras of one rig, of which the first is meant; elsewhere one must be chosen."""
 SECOND = ("right", "camera2", "cam1")

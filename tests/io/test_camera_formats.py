@@ -425,7 +425,14 @@ POLYCAM = {
     "t_00": 0.1,
     "blur_score": 3.0,
 }
-ARKIT = {"w": 752, "h": 480, "K": [458.0, 0, 0, 0, 457.0, 0, 367.0, 248.0, 1], "fps": 60, "poses": []}
+ARKIT = {
+    "w": 752,
+    "h": 480,
+    "K": [458.0, 0, 0, 0, 457.0, 0, 367.0, 248.0, 1],
+    "fps": 60,
+    "poses": [],
+    "perFrameIntrinsicCoeffs": [[458.0, 457.0, 367.0, 248.0]],
+}
 OPENSFM = {
     "v2 unknown unknown 752 480 brown 0.6": {
         "projection_type": "brown",
