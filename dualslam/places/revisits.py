@@ -230,9 +230,8 @@ class Revisits:
             if waiting is not None:
                 waiting.misses += 1
                 if waiting.misses > MAX_MISSES:
-                    why = Failure(
-                        FailureReason.UNCONFIRMED, f"confirmed {waiting.confirmations} times, {N_CONFIRMING} needed"
-                    )
+                    detail = f"{waiting.confirmations} of {N_CONFIRMING} keyframes confirmed it"
+                    why = Failure(FailureReason.UNCONFIRMED, detail)
                     record_refusal(self._record, now, submap.id, *waiting.match.place, why)
                     self._provisional = None
             return

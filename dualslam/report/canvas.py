@@ -73,7 +73,7 @@ class Canvas:
     def scale_bar(self, unit: str, drawn: FloatArray) -> Markup:
         """Return a bar of a round length, in the lower corner that points (N, 2) leave free."""
         length = nice_step(float(self.size[0]) / 5)
-        words = f"{number(length)} {unit}" if unit else f"{number(length)} units of the map"
+        words = f"{number(length)} {unit}" if unit else units_of_map(length)
         xy = self.to_svg(drawn) / [WIDTH, self.height]
         low = xy[xy[:, 1] > 0.75, 0]
         side = "right" if (low < 0.35).sum() > (low > 0.65).sum() else "left"
@@ -90,6 +90,11 @@ class Canvas:
             aria_label=description,
         )
         return tag("div", svg, words, cls="canvas")
+
+
+def units_of_map(length: float) -> str:
+    """Return a length in words, where no scale is known."""
+    return f"{number(length)} unit{'' if length == 1 else 's'} of the map"
 
 
 def nice_step(value: float) -> float:

@@ -199,13 +199,18 @@ def _configuration(run: RunData) -> Markup:
     default = Config().model_dump(mode="json")
     changed = _differences(run.config, default)
     rows = [
-        tag("tr", tag("th", name, scope="row"), tag("td", str(value)), tag("td", str(was)))
+        tag("tr", tag("th", name, scope="row"), tag("td", _short(value)), tag("td", _short(was)))
         for name, value, was in changed
     ]
     changes = tag("div", table(("field", "here", "default"), rows, "plain"), cls="scroll")
     words = tag("p", "All fields have their default values.", cls="empty")
     whole = tag("details", tag("summary", "The whole configuration"), tag("pre", run.config_text))
     return join([changes if rows else words, whole])
+
+
+def _short(value: object) -> str:
+    """Return a setting's value; one that a run found itself has more digits than anybody reads."""
+    return f"{value:.6g}" if isinstance(value, float) else str(value)
 
 
 def _differences(here: dict[str, Any], default: dict[str, Any], prefix: str = "") -> list[tuple[str, Any, Any]]:

@@ -17,6 +17,8 @@ from dualslam.report.statuses import MEANING, Stretch, count, span, stretches
 MIN_CLOSE_UP = 4
 BEYOND = 40
 """Rows before and after those of a close-up that are drawn where they are in sight."""
+_TOGETHER_PERCENT = 15.0
+"""Of the drawing: on a telephone, the words at two points that are nearer lie upon each other."""
 LETTERS = "ABCDEFGHIJKLMNOPQRSTUVWXYZ"
 
 
@@ -173,10 +175,13 @@ def _ends(scene: PlacedRun, canvas: Canvas, axes: FloatArray) -> list[Markup]:
     # The truth has both ends; without it the main map's first and last pose stand for them.
     xyz = scene.truth_xyz if len(scene.truth_row) else scene.placed[0].xyz
     uv = xyz[[0, -1]] @ axes.T
-    words = [canvas.label(uv[0], "start", "end-mark start", "first frame")]
-    if len(xyz) > 1:
-        words.append(canvas.label(uv[1], "end", "end-mark stop", "last frame"))
-    return words
+    start, end = (np.array(canvas.to_percent(at)) for at in uv)
+    if (np.abs(start - end) < _TOGETHER_PERCENT).all():
+        return [canvas.label(uv[0], "start, end", "end-mark start", "first and last frame")]
+    return [
+        canvas.label(uv[0], "start", "end-mark start", "first frame"),
+        canvas.label(uv[1], "end", "end-mark stop", "last frame"),
+    ]
 
 
 def _breakages(run: RunData, scene: PlacedRun, canvas: Canvas, axes: FloatArray) -> list[Markup]:

@@ -333,7 +333,7 @@ class System:
         if track := self._starting.find_again(view):
             return track
         if self._state.localises:
-            return Failure(FailureReason.TOO_FEW_MATCHES, "the saved map does not show this place")
+            return Failure(FailureReason.TOO_FEW_MATCHES, "fewer than three frames show a place of the saved map")
         start = self._starting.find_start(view)
         return start if isinstance(start, Failure) else self._begin(start, view)
 

@@ -15,7 +15,7 @@ from dualslam.core.types import FloatArray, FrameStatus, IntArray
 from dualslam.io.colours import GREY, load_pictures
 from dualslam.io.metric_scale import read_scale
 from dualslam.io.run_folder import MAP, FrameRow
-from dualslam.report.canvas import nice_step
+from dualslam.report.canvas import nice_step, units_of_map
 from dualslam.report.markup import Markup, join, number, tag
 from dualslam.report.page import headline
 from dualslam.report.run_data import RunData
@@ -77,7 +77,7 @@ def map_page(run: RunData) -> str | None:
     key = [_item(rgb(STATUS_COLOURS[status]), MEANING[status]) for status in MEANING if status in shown]
     key.append(_item(RED, "no pose, or doubtful"))
     metres = read_scale(run.path)
-    unit = f"{number(step * metres)} m" if metres else f"{number(step)} units of the map"
+    unit = f"{number(step * metres)} m" if metres else units_of_map(step)
     key.append(_item(GRID, f"grid: {unit}"))
     page = Template(files("dualslam.viewer").joinpath("map_page.html").read_text(encoding="utf-8"))
     title = join(f"{run.summary.get('sequence', run.name)}: the map")
