@@ -13,6 +13,7 @@ import sqlite3
 import struct
 import weakref
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass, field
 from importlib.util import find_spec
 from pathlib import Path
@@ -23,6 +24,10 @@ from dualslam.core.errors import InputError
 from dualslam.core.extras import how_to_install
 
 ROS1_MAGIC, MCAP_MAGIC, SQLITE_MAGIC = b"#ROSBAG V2.0\n", b"\x89MCAP0\r\n", b"SQLite format 3\0"
+ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
+"""Of a file or a message that rosbag2 has packed. No message that is not packed begins with it."""
+PACKED_BYTES = 2**20
+"""That are unpacked at once."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,7 +66,7 @@ def is_bag(path: Path) -> bool:
             start = file.read(16)
     except OSError:
         return False
-    return start.startswith((ROS1_MAGIC, MCAP_MAGIC)) or start == SQLITE_MAGIC
+    return start.startswith((ROS1_MAGIC, MCAP_MAGIC, ZSTD_MAGIC)) or start == SQLITE_MAGIC
 
 
 def scan(paths: list[Path]) -> Bag:
@@ -73,17 +78,25 @@ def scan(paths: list[Path]) -> Bag:
         raise InputError(f"Bags are read by rosbags, which is not installed: {how_to_install('bags')}.")
     bag = Bag(paths)
     for number, path in enumerate(paths):
-        if not is_bag(path):
-            raise InputError(f"{path} is no ROS bag and no MCAP file; give a .bag, a .mcap or a .db3 file.")
-        with path.open("rb") as file:
-            magic = file.read(8)
+        magic = _magic(path, path)
+        if magic.startswith(ZSTD_MAGIC):
+            bag.is_whole &= _unpack_file(bag, number)
+            magic = _magic(bag.paths[number], path)
         if magic == SQLITE_MAGIC[:8]:
             _scan_sqlite(bag, number)
             continue
         reader = _scan_mcap if magic == MCAP_MAGIC else _scan_ros1
-        with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
+        with bag.paths[number].open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
             bag.is_whole &= reader(bag, number, data)
     return bag
+
+
+def _magic(path: Path, named: Path) -> bytes:
+    """Return the first bytes of a file of a bag. `named`: what a user calls it, in the message."""
+    if not is_bag(path):
+        raise InputError(f"{named} is no ROS bag and no MCAP file; give a .bag, a .mcap or a .db3 file.")
+    with path.open("rb") as file:
+        return file.read(8)
 
 
 class BagReader:
@@ -97,6 +110,10 @@ class BagReader:
 
     def read(self, place: Place) -> bytes:
         """Return the bytes of a message."""
+        data = self._stored(place)
+        return _unpacked(data, "zstd") if data.startswith(ZSTD_MAGIC) else data
+
+    def _stored(self, place: Place) -> bytes:
         if place.file not in self._open:
             path = self._paths[place.file]
             self._open[place.file] = path.open("rb") if place.stop >= 0 else _connect(path)
@@ -133,14 +150,37 @@ def _unpacked(data: bytes, packing: str) -> bytes:
 
             return bytes(LZ4FrameDecompressor().decompress(data))
         if packing == "zstd":
-            try:
-                from compression.zstd import ZstdDecompressor
-            except ImportError:
-                from backports.zstd import ZstdDecompressor
-            return bytes(ZstdDecompressor().decompress(data))
-    except (OSError, EOFError, RuntimeError, ValueError):
+            return bytes(_zstd().ZstdDecompressor().decompress(data))
+    except (OSError, EOFError, RuntimeError, ValueError, _zstd().ZstdError):
         return b""
     raise InputError(f"the bag's chunks are packed as {packing!r}; pack them by lz4, zstd or bz2, or not at all.")
+
+
+def _zstd() -> Any:
+    """Return the module: Python's from 3.14 on, before that what `rosbags` brings."""
+    try:
+        from compression import zstd
+    except ImportError:
+        from backports import zstd
+    return zstd
+
+
+def _unpack_file(bag: Bag, number: int) -> bool:
+    """Give a bag an unpacked copy of a file; return whether the packed one was whole."""
+    path, unpacker = bag.paths[number], _zstd().ZstdDecompressor()
+    copy = _folder_of(bag) / path.stem
+    with path.open("rb") as packed, copy.open("wb") as out, suppress(_zstd().ZstdError):
+        while not unpacker.eof and (data := packed.read(PACKED_BYTES)):
+            out.write(unpacker.decompress(data))
+    bag.paths[number] = copy
+    return bool(unpacker.eof)
+
+
+def _folder_of(bag: Bag) -> Path:
+    """Make a folder that goes when the bag does."""
+    folder = mkdtemp(prefix="dualslam-bag-")
+    weakref.finalize(bag, shutil.rmtree, folder, ignore_errors=True)
+    return Path(folder)
 
 
 def _note(bag: Bag, topic: Topic | None, time_ns: int, place: Place) -> None:
@@ -297,9 +337,7 @@ def _pad(bag: Bag, number: int) -> bool:
     wanted, size = struct.unpack_from(">I", header, 28)[0] * page, path.stat().st_size
     if size >= wanted:
         return True
-    folder = mkdtemp(prefix="dualslam-bag-")
-    weakref.finalize(bag, shutil.rmtree, folder, ignore_errors=True)
-    copy = Path(folder) / path.name
+    copy = _folder_of(bag) / path.name
     shutil.copyfile(path, copy)
     os.truncate(copy, size // page * page)
     os.truncate(copy, wanted)

@@ -44,8 +44,8 @@ TO_RGB: dict[str, int | None] = {
 
 def recognises(folder: Path) -> bool:
     """Tell whether `folder` is a bag of ROS 2: with its `metadata.yaml`, or of nothing but files of bags."""
-    alone = all(p.suffix.lower().startswith(SUFFIXES) for p in folder.iterdir())
-    return bool(_files(folder)) and (alone or (folder / "metadata.yaml").is_file())
+    alone = all(p.suffix.lower().startswith((*SUFFIXES, ".zstd")) for p in folder.iterdir())
+    return bool(files_of_bag(folder)) and (alone or (folder / "metadata.yaml").is_file())
 
 
 def is_bag_file(path: Path) -> bool:
@@ -60,7 +60,7 @@ def has_topics(path: Path) -> bool:
 
 def open_recording(path: Path, given: Given) -> Recording:
     """Open a bag: a file, or the folder of one of ROS 2."""
-    paths = _files(path) if path.is_dir() else [path]
+    paths = files_of_bag(path) if path.is_dir() else [path]
     bag = scan(paths)
     topic = _chosen(bag, given.topic, path)
     messages = bag.messages[topic]
@@ -75,8 +75,9 @@ def open_recording(path: Path, given: Given) -> Recording:
     return Recording(path.stem, images, timestamps_s, camera, calibration=calibration, clock=where)
 
 
-def _files(folder: Path) -> list[Path]:
-    found = [p for p in folder.iterdir() if p.suffix.lower() in SUFFIXES[:2]]
+def files_of_bag(folder: Path) -> list[Path]:
+    """Return the files of a ROS 2 bag, in their order."""
+    found = [p for p in folder.iterdir() if p.name.lower().removesuffix(".zstd").endswith(SUFFIXES[:2])]
     return sorted(found, key=lambda p: natural_key(p.name))
 
 
@@ -168,7 +169,7 @@ class BagImages:
         # ROS 1: a number, seconds, nanoseconds; ROS 2: four bytes of the encoding, seconds, nanoseconds.
         stamps_ns = []
         for place in self._places:
-            seconds, rest = struct.unpack_from("<II", reader.read(place), 4)
+            seconds, rest = struct.unpack_from("<II", reader.read(place).ljust(12, b"\0"), 4)  # a broken one is short
             stamps_ns.append(seconds * 10**9 + rest)
         reader.close()
         stamps = np.array(stamps_ns)

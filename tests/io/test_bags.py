@@ -23,7 +23,9 @@ from dualslam.run.sources import open_images_of_run
 N = 12
 WIDTH, HEIGHT = 64, 48
 BEGIN_NS = 1_700_000_000_123_456_789
-KINDS = ["bag", "bag_lz4", "bag_bz2", "db3", "mcap", "mcap_zstd"]
+PACKED = ["db3_message", "db3_file", "mcap_message", "mcap_file"]
+"""Each message, or the whole file, as `ros2 bag record --compression-mode` does."""
+KINDS = ["bag", "bag_lz4", "bag_bz2", "db3", "mcap", "mcap_zstd", *PACKED]
 PATTERN = np.random.default_rng(0).integers(0, 256, (HEIGHT, WIDTH, 3), np.uint8)
 
 
@@ -48,10 +50,11 @@ class Writer:
             if "_" in kind:
                 self.bag.set_compression(getattr(Writer1.CompressionFormat, kind[4:].upper()))
         else:
-            plugin = StoragePlugin.SQLITE3 if kind == "db3" else StoragePlugin.MCAP
+            plugin = StoragePlugin.SQLITE3 if kind.startswith("db3") else StoragePlugin.MCAP
             self.bag = Writer2(path, version=9, storage_plugin=plugin)
-            if kind == "mcap_zstd":
-                self.bag.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
+            if "_" in kind:
+                mode = "STORAGE" if kind == "mcap_zstd" else kind.partition("_")[2].upper()
+                self.bag.set_compression(getattr(CompressionMode, mode), CompressionFormat.ZSTD)
         self.connections: dict[str, Any] = {}
 
     def write(self, topic: str, kind: str, time_ns: int, **fields: Any) -> None:
@@ -93,9 +96,9 @@ def write_bag(path: Path, kind: str, fill: Any) -> Path:
     writer = Writer(path, kind)
     with writer.bag:
         fill(writer)
-    if writer.is_ros1 or kind == "db3":
+    if writer.is_ros1 or kind.startswith("db3"):
         return writer.path
-    return next(writer.path.glob("*.mcap"))
+    return next(writer.path.glob("*.mcap*"))
 
 
 def raw(writer: Writer) -> None:
@@ -120,12 +123,16 @@ def sequence_path(folder: Path, kind: str) -> Path:
     return folder / "drive.bag" if kind.startswith("bag") else folder / "drive"
 
 
-@pytest.mark.parametrize("kind", [kind for kind in KINDS if kind != "mcap_zstd"])  # its one chunk is cut
+WHOLE_ONLY = ("mcap_zstd", "db3_file", "mcap_file")
+"""Packed in one piece each, as small as they are: a piece that was cut is lost."""
+
+
+@pytest.mark.parametrize("kind", [kind for kind in KINDS if kind not in WHOLE_ONLY])
 def test_what_is_before_a_cut_is_read(tmp_path: Path, kind: str, caplog: pytest.LogCaptureFixture) -> None:
     path = write_bag(tmp_path / "drive", kind, raw)
-    path = next(path.glob("*.db3")) if path.is_dir() else path
+    path = next(path.glob("*.db3*")) if path.is_dir() else path
     data = path.read_bytes()
-    cut = tmp_path / f"cut{path.suffix}"
+    cut = tmp_path / f"cut{''.join(path.suffixes)}"
     cut.write_bytes(data[: int(0.7 * len(data))])
     with caplog.at_level(logging.WARNING):
         frames = list(open_sequence(cut))

@@ -13,7 +13,7 @@ from dualslam.core.geometry import se3, so3
 from dualslam.core.metric_problem import MeasurementRow
 from dualslam.core.types import FloatArray
 from dualslam.io.bag_files import BagReader, scan
-from dualslam.io.bags import SUFFIXES, _message
+from dualslam.io.bags import _message, files_of_bag
 from dualslam.io.measurements.geodetic import FIX, required_sigma
 
 NAV_SAT_FIX, IMU, ODOMETRY = "sensor_msgs/msg/NavSatFix", "sensor_msgs/msg/Imu", "nav_msgs/msg/Odometry"
@@ -28,10 +28,10 @@ def bag_rows(path: Path, sigma: float | None) -> list[MeasurementRow]:
 
     Raises `InputError` if the bag has no such topic, or states no sigmas and none is given.
     """
-    paths = [path] if path.is_file() else sorted(p for p in path.iterdir() if p.suffix.lower() in SUFFIXES)
-    reader, rows = BagReader(paths), list[MeasurementRow]()
+    bag = scan([path] if path.is_file() else files_of_bag(path))
+    reader, rows = BagReader(bag.paths), list[MeasurementRow]()
     try:
-        for topic, messages in scan(paths).messages.items():
+        for topic, messages in bag.messages.items():
             where, known = f"{path}, {topic.name}", list[tuple[float, FloatArray]]()
             for time_ns, place in messages if topic.type in (NAV_SAT_FIX, IMU, ODOMETRY) else ():
                 message: Any = _message(reader.read(place), topic)
