@@ -18,7 +18,7 @@ STRETCH = "input_horizontal_stretch"
 
 
 def in_common_keys(content: dict[str, Any], where: str) -> dict[str, Any]:
-    """Return a file of Theia, Gyroflow, vikit or KITTI in the keys of other tools, and any other as it is.
+    """Return a file with keys of its own (Theia's, KITTI's, ...) in those of other tools, and any other as it is.
 
     Raises `InputError` if its images are stretched, or its projections are of several cameras.
     """
@@ -30,6 +30,10 @@ def in_common_keys(content: dict[str, Any], where: str) -> dict[str, Any]:
         return _of_vikit(content)
     if "P0" in content and "P1" in content:
         return _of_kitti(content, where)
+    if isinstance(content.get("calibration"), list):
+        return _of_mast3r_slam(content)
+    if isinstance(data := content.get("Dataset"), dict) and isinstance(data.get("Calibration"), dict):
+        return _of_monogs(data["Calibration"])
     return content
 
 
@@ -60,6 +64,19 @@ def _of_vikit(content: dict[str, Any]) -> dict[str, Any]:
     found = {str(key).removeprefix("cam_"): value for key, value in content.items() if str(key).startswith("cam_")}
     lens = [found.pop(f"d{i}") for i in range(len(found)) if f"d{i}" in found]
     return found | {"distortion_coefficients": lens}
+
+
+def _of_mast3r_slam(content: dict[str, Any]) -> dict[str, Any]:
+    """Read MASt3R-SLAM's ``intrinsics.yaml``: fx, fy, cx, cy, and OpenCV's coefficients behind them."""
+    numbers, rest = content["calibration"], {key: value for key, value in content.items() if key != "calibration"}
+    return rest | {"lens_model": "radtan", "camera_matrix": numbers[:4], "distortion_coefficients": numbers[4:]}
+
+
+def _of_monogs(content: dict[str, Any]) -> dict[str, Any]:
+    """Read the calibration of a data set of MonoGS, whose coefficients count if the images are distorted."""
+    names = ("fx", "fy", "cx", "cy", "width", "height")
+    lens = ("k1", "k2", "p1", "p2", "k3") if content.get("distorted") else ()
+    return {"lens_model": "radtan"} | {name: content[name] for name in (*names, *lens) if name in content}
 
 
 def _of_kitti(content: dict[str, Any], where: str) -> dict[str, Any]:

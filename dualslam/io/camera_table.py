@@ -230,7 +230,7 @@ class CameraTable:
         if len(said) > 1:
             named = " and ".join(f"{lenses[lens]} ({lens})" for lens in said)
             raise InputError(f"{self.where}: {named} are two models; keep the one that is right.")
-        of_pinholes = self.has("matrix") or {"flx", "cameraanglex", "t00"} & self.own
+        of_pinholes = self.has("matrix") or {"flx", "cameraanglex", "t00", "p1"} & self.own  # no other lens has a p1
         if not lenses and not of_pinholes and not any(k.path[0] in ("Camera", "Camera1", "LEFT") for k in self._keys):
             raise unknown_camera(self.where)
         return said[0] if said else ANY

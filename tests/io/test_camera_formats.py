@@ -580,6 +580,11 @@ FORMATS = [
      "cam_d0: -0.28\ncam_d1: 0.07\ncam_d2: 0.0002\ncam_d3: 0.00002\n", RADTAN),
     ("maplab_unified.yaml", SVO.replace("pinhole", "unified-projection").replace("[458", "[0.9, 458").replace("[-0.28, 0.07, 0.0002, 2.0e-05]", "[0, 0, 0, 0]"),
      OmniCamera(752, 480, 458.0, 457.0, 367.0, 248.0, xi=0.9)),
+    ("mast3r_slam.yaml", "width: 752\nheight: 480\ncalibration: [458, 457, 367, 248, -0.28, 0.07, 0.0002, 0.00002, 0.01]\n", FIVE),
+    ("mast3r_pinhole.yaml", "width: 752\nheight: 480\ncalibration: [458.0, 457.0, 367.0, 248.0]\n", PINHOLE),
+    ("monogs.yaml", "Dataset:\n  type: tum\n  Calibration: {fx: 458, fy: 457, cx: 367, cy: 248, k1: -0.28, k2: 0.07, p1: 0.0002, p2: 0.00002, k3: 0.01, "
+     "width: 752, height: 480, depth_scale: 5000.0, distorted: True}\n", FIVE),
+    ("radtan_by_keys.yaml", "fx: 458\nfy: 457\ncx: 367\ncy: 248\nk1: -0.28\nk2: 0.07\np1: 0.0002\np2: 0.00002\nwidth: 752\nheight: 480\n", RADTAN),
     ("dso_equi.txt", "EquiDistant 380 381 367 248 0.003 0.0007 -0.002 0.0002\n752 480\nfull\n640 480\n", FISHEYE),
 ]  # fmt: skip
 
