@@ -9,17 +9,16 @@ from functools import partial
 
 import numpy as np
 
-from dualslam.backend.observability import MIN_DEPTH_MU
+from dualslam.backend.final_refinement import LEAST_NOISE
 from dualslam.backend.point_refinement import huber
 from dualslam.backend.schur import Lens, Optimum, State, System, optimise
 from dualslam.core.bundle import BundleProblem
 from dualslam.core.camera.corrected import LensCorrection
 from dualslam.core.chi_square import MEDIAN_CHI2
 from dualslam.core.errors import SolverError
+from dualslam.core.noise_model import MIN_DEPTH_MU
 from dualslam.core.types import FloatArray
 
-MIN_NOISE_RATIO = 0.05
-"""Residuals smaller than this share of their sigmas would be an exact simulation."""
 MAX_ITERATIONS, TOLERANCE = 100, 1e-5
 """Most need a few. Where the focal length is far off, the way is long and bent: lens and focal length make up for each
 other."""
@@ -162,4 +161,4 @@ def _noise_ratio(problem: BundleProblem, state: State) -> float:
     p_cam = np.einsum("rji,rj->ri", T[p.kf, :3, :3], state.xyz_mu[p.point] - T[p.kf, :3, 3])
     uv = LensCorrection.of_vector(state.lens).distort_px(p.K, p_cam[:, :2] / p_cam[:, 2:])
     chi2 = ((uv - p.uv_px) ** 2).sum(1) / p.sigma_px**2
-    return max(MIN_NOISE_RATIO, math.sqrt(float(np.median(chi2)) / MEDIAN_CHI2[2]))
+    return max(LEAST_NOISE, math.sqrt(float(np.median(chi2)) / MEDIAN_CHI2[2]))

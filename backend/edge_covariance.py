@@ -15,9 +15,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from dualslam.backend.observability import MIN_DEPTH_MU
+from dualslam.backend.noise import GAUGE_SIGMA
 from dualslam.core.errors import SolverError
 from dualslam.core.geometry import se3, so3
+from dualslam.core.noise_model import MIN_DEPTH_MU
 from dualslam.core.robust import huber_weights
 from dualslam.core.types import FloatArray, IntArray
 from dualslam.map.submap import Submap
@@ -28,8 +29,6 @@ LONGEST = 24
 """Of more keyframes between two ends only those near the ends are looked at (an edge across what both of them see)."""
 LOOSE_ROTATION_RAD, LOOSE_TRANSLATION_MU = 0.3, 1.0
 """Sigmas of a prior on each pose of the window: where its factors say nothing the answer is large, and not infinite."""
-UNIT_SIGMA = 1e-5
-"""With which the unit at the first keyframe is held."""
 
 
 def edge_covariances(
@@ -89,7 +88,7 @@ def _covariance(
     system = information.reshape(6 * n, 6 * n) + flat.reshape(-1, 6 * n).T @ moves.reshape(-1, 6 * n)
     R = submap.keyframe_poses(window)[:, :3, :3]
     units = [_unit(c, kf, point, x_cam, R[c], moves, n) for c in (a, b)]
-    system += np.outer(units[0], units[0]) / UNIT_SIGMA**2
+    system += np.outer(units[0], units[0]) / GAUGE_SIGMA**2
     free = np.delete(np.arange(6 * n), np.arange(6 * a, 6 * a + 6))
     read = np.zeros((7, 6 * n))
     read[:6, 6 * b : 6 * b + 6] = np.eye(6)

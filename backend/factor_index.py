@@ -7,18 +7,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dualslam.backend.observability import MIN_DEPTH_MU, compute_depth_sigmas, compute_residuals, numbered, take_mask
+from dualslam.backend.observability import compute_depth_sigmas, compute_residuals, numbered, take_mask
 from dualslam.backend.selection import Candidates, choose_factors
 from dualslam.core.config.settings import GraphConfig
+from dualslam.core.noise_model import COVISIBLE, MAX_DEPTH_SIGMA, MIN_DEPTH_MU, MIN_LANDMARKS, PROOF_VIEWS
 from dualslam.core.types import BoolArray, FloatArray, IntArray
 from dualslam.map.submap import Submap
 from dualslam.map.tables import Table
 
-MAX_DEPTH_SIGMA = 0.25
-"""A landmark enters the graph once its views fix its distance to this relative standard deviation, and leaves at twice
-that. 0.25 is about half a degree of parallax at 1 px and a focal length of 700 px."""
-MIN_VIEWS = 3
-"""Keyframes that must see a landmark before it enters the graph: two views fit almost any pair of poses."""
 YOUNG_KEYFRAMES = 5
 """Up to so many keyframes two views are enough, or there would be no graph to start with."""
 ENTER_SIGMAS = 6.0
@@ -26,8 +22,6 @@ ENTER_SIGMAS = 6.0
 throw their point behind a camera, and the solver fails."""
 INSERT_SIGMAS = 25.0
 """Observations of a landmark that is in the graph are refused only beyond this; the robust kernel has the rest."""
-MIN_TIES = 6
-"""Keyframes tied to the graph by fewer landmarks are held at their pose by a loose prior, until they have more."""
 
 OUTSIDE = -1
 SMALL_MAP = 20
@@ -39,8 +33,8 @@ FACTORS_PER_LANDMARK = 6
 BUDGET, MOST_RATIO = 3000, 2.5
 """Factors of all keyframes that see what the newest ones see, about: with fewer such keyframes each has more of them,
 up to so many times `GraphConfig.factors_per_keyframe`."""
-N_NEWEST, MIN_SHARED = 3, 15
-"""Keyframes that are the newest, and landmarks by which another sees what they see."""
+N_NEWEST = 3
+"""Keyframes that are the newest."""
 LEAVE_RATIO = 2.0
 """A landmark leaves the graph at this many times the uncertainty at which it may enter, so that it does not flutter."""
 
@@ -60,7 +54,7 @@ class Plan:
     new_keyframes: IntArray  # (K,)
     gone_keyframes: IntArray  # (K,)
     weak_keyframes: IntArray
-    """(K,): all keyframes that the graph, as it will be, ties to fewer than `MIN_TIES` well-seen landmarks."""
+    """(K,): all keyframes that the graph, as it will be, ties to fewer than `MIN_LANDMARKS` well-seen landmarks."""
 
 
 class FactorIndex:
@@ -211,7 +205,7 @@ class FactorIndex:
             len(submap.landmarks),
             self._per_keyframe,
             FACTORS_PER_LANDMARK if self._per_keyframe < ALL else ALL,
-            2 if young else MIN_VIEWS,
+            2 if young else PROOF_VIEWS,
         )
 
     def _factors_per_keyframe(self, submap: Submap, admitted: BoolArray, keyframes: IntArray) -> int:
@@ -225,7 +219,7 @@ class FactorIndex:
             return ALL
         kf, lm = obs["kf"][: len(admitted)][admitted], obs["landmark"][: len(admitted)][admitted]
         seen = take_mask(lm[np.isin(kf, keyframes[-N_NEWEST:])], len(submap.landmarks))
-        beside = int(np.count_nonzero(np.bincount(kf[seen[lm]]) >= MIN_SHARED))
+        beside = int(np.count_nonzero(np.bincount(kf[seen[lm]]) >= COVISIBLE))
         wanted = max(
             config.factors_per_keyframe, min(int(MOST_RATIO * config.factors_per_keyframe), BUDGET // max(beside, 1))
         )
@@ -274,7 +268,7 @@ class FactorIndex:
         # Two views of a point fit whatever the poses are along their epipolar lines: only the third tests them.
         n_views = np.bincount(index, minlength=len(names))
         young = len(submap.keyframes) <= YOUNG_KEYFRAMES
-        enough = n_views >= np.where(known[names] | young, 2, MIN_VIEWS)
+        enough = n_views >= np.where(known[names] | young, 2, PROOF_VIEWS)
         certain[names] = (sigmas < limit) & enough
         return fits, certain
 
@@ -283,4 +277,4 @@ class FactorIndex:
         k, j = kf[inside], lm[inside]
         held = np.bincount(j)[j] >= 3 if len(j) else np.zeros(0, bool)
         ties = np.bincount(k[held], minlength=int(live.max(initial=0)) + 1)
-        return live[ties[live] < MIN_TIES]
+        return live[ties[live] < MIN_LANDMARKS]

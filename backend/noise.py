@@ -18,8 +18,6 @@ seen from further apart, have some more. 1: gates are never tighter than the pix
 
 GAUGE_SIGMA = 1e-5
 """Sigma of the priors that fix a gauge (rad, and submap units): tight, yet far from the limits of a double."""
-GAUGE_RANGE_RATIO = 1e-4
-"""Sigma of the first baseline, relative to its length."""
 MIN_VIEWS, MIN_OBSERVATIONS = 4, 400
 """What the residuals' variance is read from: landmarks of so many views, and so many of their observations, which put
 the median's own sigma at 7 %."""

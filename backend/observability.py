@@ -12,10 +12,8 @@ import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
+from dualslam.core.noise_model import MIN_DEPTH_MU
 from dualslam.core.types import BoolArray, FloatArray, IntArray
-
-MIN_DEPTH_MU = 1e-3
-"""Points nearer to the camera's plane than this are taken as behind it (a submap's median initial depth is 1)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from dualslam.backend.observability import MIN_DEPTH_MU, projection_jacobian, reproject, sum_products
+from dualslam.backend.observability import projection_jacobian, reproject, sum_products
+from dualslam.core.noise_model import MIN_DEPTH_MU
 from dualslam.core.types import FloatArray, IntArray
 from dualslam.map.submap import Submap
 

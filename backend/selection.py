@@ -14,15 +14,12 @@ import numpy as np
 
 from dualslam.backend.observability import take_mask
 from dualslam.core.firsts import rank_in_runs
+from dualslam.core.noise_model import CELLS_ACROSS, PROOF_VIEWS
 from dualslam.core.types import BoolArray, FloatArray, IntArray
 
-CELLS_ACROSS = 16
-"""Cells of an image's width by which observations are spread, as in the choice of what a keyframe observes."""
 _CELLS_A_ROW = 4 * CELLS_ACROSS + 1
 """Up to four times the width: what lies farther out, as a lens may have it, is in the last."""
 _N_CELLS = _CELLS_A_ROW**2
-FIRST_VIEWS = 3
-"""Views that a landmark gets back when it has lost some: two fit almost any pair of poses, a third one does not."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -162,7 +159,7 @@ def _top_up(
     """Give landmarks that lost views others in their stead, and drop those that are left with fewer than two."""
     landmark = candidates.landmark
     lost = np.unique(landmark[factors & ~chosen])
-    lost = lost[views[lost] < max(min_views, FIRST_VIEWS)]
+    lost = lost[views[lost] < max(min_views, PROOF_VIEWS)]
     if len(lost) == 0:
         return
     mark = np.zeros(len(views), bool)
@@ -170,7 +167,7 @@ def _top_up(
     row = np.flatnonzero(admitted & mark[landmark])
     row = row[np.lexsort((candidates.kf[row], landmark[row]))]
     n = np.bincount(landmark[row], minlength=len(views))
-    taken = spread_evenly(rank_in_runs(landmark[row]), n[landmark[row]], np.full(len(row), FIRST_VIEWS))
+    taken = spread_evenly(rank_in_runs(landmark[row]), n[landmark[row]], np.full(len(row), PROOF_VIEWS))
     chosen[row[taken]] = True
     few = mark & (n < 2)
     chosen[few[landmark]] = False

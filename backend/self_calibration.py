@@ -34,6 +34,7 @@ from dualslam.core.config.calibration_config import CalibrationConfig
 from dualslam.core.errors import SolverError
 from dualslam.core.estimates import MAX_PRIOR_SIGMAS, CalibrationEstimate, PreferredCamera
 from dualslam.core.geometry import so3
+from dualslam.core.noise_model import INFLATION, PROOF_VIEWS
 from dualslam.core.types import Failure, FailureReason, FloatArray, IntArray
 from dualslam.map.submap import Submap
 
@@ -41,16 +42,11 @@ MAX_KEYFRAMES = 60
 """Keyframes of the window, neighbours in time; of all such windows the one with most turning."""
 MIN_ROTATION_DEG = 15.0
 """Turning, summed over the window, below which nothing is tried: the focal length could not be known."""
-INFLATION = 4.0
-"""How much larger than the residuals say the errors of the pixels are taken to be, because neighbouring ones err alike.
-With the exact camera (rendered images) corrections came out up to 3.8 times as far from zero as the Hessian says."""
 PRINCIPAL_POINT_SIGMA = 0.015
 """Prior of the principal point, relative to the image's width: what lenses are off the middle."""
-K1_SIGMA = 0.03
+LENS_SIGMA = 0.03
 """Prior of the radial distortion that is left in the rectified image: the displacement at 45 degrees from the axis (or
 at the image's corner, if that is farther out), relative to the radius."""
-K2_SIGMA = 0.03
-"""The same for the term with the fourth power of the radius."""
 MAX_SIGMA = 0.02
 """Of the log focal length: a bound for answers about a camera that is far off, by more than `FAR_SIGMAS`, or hardly
 known, by `CalibrationConfig.log_focal_sigma`. There 2 % are better than none; on a straight road answers that are less
@@ -62,8 +58,6 @@ MIN_DISTANCE2 = CHI2_999[5]
 """Squared Mahalanobis distance from the present calibration above which the new one is taken: chi-square, 5 degrees of
 freedom, 99.9 %."""
 
-MIN_VIEWS = 3
-"""Keyframes of the window that must see a landmark: two views have little to say beyond their own relative pose."""
 MAX_DEPTH_SIGMA = 0.3
 """Relative; landmarks whose distance is known no better make the problem singular and say nothing."""
 MIN_OBSERVATIONS = 1000
@@ -280,7 +274,7 @@ def make_problem(
     ok = np.isfinite(res.chi2)
     depth_sigmas = compute_depth_sigmas(submap.K, T, kf[ok], res.xyz_cam[ok], sigma[ok], landmark[ok], n_landmarks)
     n_views = np.bincount(landmark[ok], minlength=n_landmarks)
-    good = np.flatnonzero((n_views >= MIN_VIEWS) & (depth_sigmas < MAX_DEPTH_SIGMA))
+    good = np.flatnonzero((n_views >= PROOF_VIEWS) & (depth_sigmas < MAX_DEPTH_SIGMA))
     good = np.random.default_rng(seed).permutation(good)
     good = np.sort(good[np.cumsum(n_views[good]) <= max_observations])
     chosen = np.flatnonzero(ok & take_mask(good, n_landmarks)[landmark])
@@ -308,7 +302,7 @@ def prior_sigmas(problem: BundleProblem, width_px: int, config: CalibrationConfi
     xy = (problem.uv_px - K[:2, 2]) / (K[0, 0], K[1, 1])
     r2 = max(1.0, float((xy * xy).sum(1).max(initial=0.0)))
     centre = PRINCIPAL_POINT_SIGMA * width_px
-    return np.array([config.log_focal_sigma, centre, centre, K1_SIGMA / r2, K2_SIGMA / (r2 * r2)])
+    return np.array([config.log_focal_sigma, centre, centre, LENS_SIGMA / r2, LENS_SIGMA / (r2 * r2)])
 
 
 def _rotation_steps(submap: Submap, ids: IntArray) -> FloatArray:

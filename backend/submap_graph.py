@@ -16,7 +16,7 @@ import gtsam
 import numpy as np
 
 from dualslam.backend import convert
-from dualslam.backend.factor_index import INSERT_SIGMAS, FactorIndex, Plan
+from dualslam.backend.factor_index import INSERT_SIGMAS, N_NEWEST, FactorIndex, Plan
 from dualslam.backend.noise import LEAST_NOISE, OUTLIER_CHI2, PixelNoise, residual_variance
 from dualslam.backend.observability import compute_residuals, take_mask
 from dualslam.backend.point_refinement import refine_points
@@ -57,9 +57,6 @@ REBUILD_ATTEMPTS = 8
 RELINEARISE_EVERY = 3
 MISFIT_CHI2 = 1.2
 """Each third update relinearises, and each that follows one whose newest observations fit worse than this."""
-REFINED_KEYFRAMES = 3
-"""After each update points beside the graph are refined that so many of the newest keyframes see; after a reading of
-everything, all."""
 FAR_MU = 200.0
 """A point this far from its camera (the median initial depth is 1) is looked at again before the next solution."""
 
@@ -327,7 +324,7 @@ class ISam2SubmapGraph:
         else:
             T, xyz_graph = np.array([optimum.poses[k] for k in keyframes.tolist()]), optimum.xyz_mu[landmarks]
         poses = dict(zip(keyframes.tolist(), T, strict=True))
-        newest = None if everything else list(submap.keyframes)[-REFINED_KEYFRAMES:]
+        newest = None if everything else list(submap.keyframes)[-N_NEWEST:]
         beside = landmarks_beside(submap, inside, part.in_graph, newest)
         xyz = (submap.landmarks["xyz_mu"] if optimum is None else optimum.xyz_mu).copy()
         xyz[landmarks] = xyz_graph

@@ -14,10 +14,11 @@ import gtsam
 import numpy as np
 
 from dualslam.backend.convert import pose_key, to_pose3
-from dualslam.backend.factor_index import MIN_TIES, OUTSIDE, Plan
-from dualslam.backend.noise import GAUGE_RANGE_RATIO, GAUGE_SIGMA, PixelNoise, pose_sigmas
+from dualslam.backend.factor_index import OUTSIDE, Plan
+from dualslam.backend.noise import GAUGE_SIGMA, PixelNoise, pose_sigmas
 from dualslam.backend.observability import find_components
 from dualslam.core.geometry import se3
+from dualslam.core.noise_model import BASELINE_SIGMA, GROUP, MIN_DEPTH_MU, MIN_LANDMARKS
 from dualslam.core.types import FloatArray, IntArray
 from dualslam.map.anchors import RelativePose
 from dualslam.map.submap import Submap
@@ -72,14 +73,11 @@ def relative_pose(keyframe_id: int, known: RelativePose) -> gtsam.BetweenFactorP
 
 def baseline_factor(first: int, second: int, length_mu: float) -> gtsam.RangeFactorPose3:
     """Return the factor that fixes a submap's scale: the distance between the centres of two keyframes."""
-    noise = gtsam.noiseModel.Isotropic.Sigma(1, GAUGE_RANGE_RATIO * length_mu)
+    noise = gtsam.noiseModel.Isotropic.Sigma(1, BASELINE_SIGMA * length_mu)
     return gtsam.RangeFactorPose3(pose_key(first), pose_key(second), length_mu, noise)
 
 
-MIN_BASELINE_MU = 1e-3
-"""Shorter than this a baseline cannot carry the scale (the median initial depth is 1)."""
 MOVED_TOLERANCE = 1e-2
-N_NEIGHBOURS = 10
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -140,13 +138,13 @@ def choose_gauge(submap: Submap, current: Gauge | None, pose: Callable[[int], Fl
         if mine[1] is None and len(live) == 1:
             return current
     for second in (wanted_second, mine[1]):
-        if serves(second) and distance(second) > MIN_BASELINE_MU:
+        if serves(second) and distance(second) > MIN_DEPTH_MU:
             return Gauge(first, T_first, second, distance(second))
     # The farthest of the keyframes that share most with the first one.
     ids, _ = submap.covisible(submap.landmarks_of_keyframes([first]))
-    near = [k for k in ids.tolist() if k != first and k in live][:N_NEIGHBOURS] or [k for k in live if k != first]
+    near = [k for k in ids.tolist() if k != first and k in live][: 2 * GROUP] or [k for k in live if k != first]
     second = max(near, key=distance, default=None)
-    if second is None or distance(second) <= MIN_BASELINE_MU:
+    if second is None or distance(second) <= MIN_DEPTH_MU:
         return (
             current
             if current is not None and first == mine[0] and mine[1] is None
@@ -220,7 +218,7 @@ class Ties:
         known = {k: r for k, r in submap.relative_poses.items() if {k, r.keyframe_id} <= submap.keyframes.keys()}
         wanted = ((weak | self.forced) & submap.keyframes.keys()) - known.keys()
         wanted.discard(gauge.first)
-        if gauge.second is not None and gauge.second in wanted and n_rows(gauge.second) >= MIN_TIES:
+        if gauge.second is not None and gauge.second in wanted and n_rows(gauge.second) >= MIN_LANDMARKS:
             wanted.discard(gauge.second)  # the baseline gives it its scale, so that landmarks of two views tie it
         remove += [factor for k, factor in self.holds.items() if k not in wanted]
         new_holds = sorted(wanted - self.holds.keys())

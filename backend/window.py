@@ -13,6 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from dualslam.backend.factor_index import INSERT_SIGMAS
 from dualslam.backend.noise import LEAST_NOISE, OUTLIER_CHI2, residual_variance
 from dualslam.backend.observability import projection_jacobian, reproject
 from dualslam.backend.point_refinement import huber, normal_equations
@@ -31,8 +32,6 @@ FIRST_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-4, 1e-7, 1e2
 """Levenberg-Marquardt, relative to the diagonal."""
 CONVERGED = 1e-4
 """Relative decrease of the cost below which to stop."""
-NEWEST_CHI2_CAP = 625.0
-"""As `dualslam.backend.factor_index.INSERT_SIGMAS`: one wild match does not make the newest keyframe's mean."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -93,7 +92,7 @@ class NumpyWindowSolver:
         n_views = np.bincount(window.point, minlength=len(ids))[window.point]
         noise2 = residual_variance(after.chi2, n_views, LEAST_NOISE**2)
         mine = window.pose == 0
-        chi2 = np.minimum(after.chi2[mine], NEWEST_CHI2_CAP)
+        chi2 = np.minimum(after.chi2[mine], INSERT_SIGMAS**2)
         sound = np.isfinite(after.xyz).all(axis=1) & (
             sum_by(window.point, np.isinf(after.chi2)[:, None], len(ids))[:, 0] == 0
         )

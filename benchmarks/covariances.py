@@ -19,13 +19,14 @@ import numpy as np
 import dualslam
 from dualslam.core.chi_square import CHI2_95
 from dualslam.core.geometry import se3
+from dualslam.core.noise_model import GROUP
 from dualslam.core.types import FloatArray, IntArray
 from dualslam.lab.disturbances import Corruption, CorruptionKind
 from dualslam.lab.metrics.alignment import align_points
 from dualslam.lab.metrics.pose_consistency import pose_nees
 from dualslam.lab.synthetic import make_sequence
 from dualslam.map.submap import Submap
-from dualslam.run.claims import GROUP, claims_of
+from dualslam.run.claims import claims_of
 
 AROUND = 4
 """Keyframes before and after that a position is aligned with."""

@@ -17,6 +17,7 @@ import gtsam
 import numpy as np
 
 from dualslam.backend import convert
+from dualslam.backend.atlas_solver import LEAST_SIGMAS
 from dualslam.backend.measurements.exports import export_graph
 from dualslam.backend.measurements.path import CameraPath, Term, attach
 from dualslam.backend.measurements.start import MAX_OFFSET_S, POSITION, QUANTILE_99, MetricStart, find_start, up_of
@@ -28,8 +29,6 @@ from dualslam.core.metric_problem import MeasurementSource, MetricProblem, Metri
 from dualslam.core.types import FloatArray
 
 ODOMETRY = ("within", "rollover")
-LEAST_SIGMAS = np.array([1e-4, 1e-4, 1e-4, 5e-4, 5e-4, 5e-4, 5e-4])
-"""As in the atlas' graph: no connection is taken as surer."""
 DRIFTS = (1.0, 2.0, 4.0, 8.0)
 """How many times the map's own sigmas are taken: the smallest at which it agrees with the measurements counts."""
 FEW_REJECTED = 0.125
@@ -37,8 +36,6 @@ FEW_REJECTED = 0.125
 GAUGE_SIGMAS = np.ones(7)
 """Of a prior on one node of each submap (rad, extents of the map, log-scale): it holds what no measurement fixes."""
 GNC_GROWTH, GNC_END = 3.0, 1e3
-CLOCK_SIGMAS = 2.5
-"""Below, an offset is chance: one in a hundred."""
 N_SETTLED = 3
 """Rounds of least squares and hard rejection."""
 UPRIGHT_SIGMA = 0.5
@@ -203,7 +200,7 @@ class JointGraph:
         return float((((sim3.rotation(S) @ up - [0.0, 0.0, 1.0]) / UPRIGHT_SIGMA) ** 2).sum())
 
     def _set_clocks_right(self, graph: gtsam.NonlinearFactorGraph) -> bool:
-        """Take clocks for right whose offset is less than `CLOCK_SIGMAS` of its sigmas; return whether any was.
+        """Take clocks for right whose offset may be chance, as one in a hundred is larger; return whether any was.
 
         An offset that is estimated in vain costs accuracy along the way: 0.07 s are 0.7 m at 10 m/s.
         """
@@ -211,7 +208,7 @@ class JointGraph:
         n = len(self._clock)
         for source, key in list(self._clock.items()):
             sigma = float(np.sqrt(marginals.marginalCovariance(key)[0, 0]))
-            if abs(self.offsets_s[source] + float(self.values.atVector(key)[0])) < CLOCK_SIGMAS * sigma:
+            if abs(self.offsets_s[source] + float(self.values.atVector(key)[0])) < np.sqrt(CHI2_99[1]) * sigma:
                 self.values.erase(self._clock.pop(source))
                 self._right_clocks[source] = -self.offsets_s[source]
         return len(self._clock) < n

@@ -42,7 +42,7 @@ class NodeView:
     @classmethod
     def of(cls, submap: Submap, knots: list[int], warp: Warp | None) -> NodeView:
         """Look at a submap."""
-        seen = [ids[ids >= 0] for ids in (submap.landmark_of[k] for k in knots)]
+        seen = [submap.seen_in(k) for k in knots]
         distance_mu = submap.landmarks["distance_mu"].copy()
         obs = submap.observations
         return cls(

@@ -14,6 +14,7 @@ from dualslam.core.config.settings import AttemptConfig, Config, FrontendConfig
 from dualslam.core.errors import ConfigError
 from dualslam.core.estimates import PreferredCamera
 from dualslam.core.interfaces import Frontend, SubmapGraph
+from dualslam.core.noise_model import SAME_POINT_PX
 from dualslam.core.types import Failure, FailureReason, Frame, IntArray, LateFrame, View
 from dualslam.frontends.features.image_features import ImageFeatures
 from dualslam.frontends.frame_reader import view_of
@@ -23,7 +24,6 @@ from dualslam.frontends.gap.refinding import Refinder
 from dualslam.frontends.registry import FOR_WALKS, create_frontend, find_missing
 from dualslam.frontends.tracking.visual import VisualFrontEnd
 from dualslam.linking import DescriptorMatcher
-from dualslam.linking.gates import DESCRIPTOR_RADIUS_PX
 from dualslam.map.submap import Submap
 from dualslam.recovery.job import Attempt, RecoveryJob, RecoveryParts
 
@@ -77,7 +77,7 @@ def recovery_parts(
         attempts=_attempts(config, frontend, live, camera, auxiliaries),
         posing=Attempt("live", live),
         new_graph=new_graph or graph_maker(config),
-        matcher=DescriptorMatcher(frontend.distance, frontend.max_distance, DESCRIPTOR_RADIUS_PX),
+        matcher=DescriptorMatcher(frontend.distance, frontend.max_distance, SAME_POINT_PX),
         find_camera=find_camera,
         config=config,
         read=read,

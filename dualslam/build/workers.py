@@ -32,10 +32,8 @@ WORKER_BUDGET = 0.75
 """Share of the time after which a worker counts as hung that its walks may take: what they have by then is not lost."""
 WALK_LIMIT_S = 120.0
 """After which a worker counts as hung, and its recovery as failed. A walk over a full buffer of 10 s takes a tenth."""
-GRAPH_LIMIT_S = 30.0
-"""After which the process that has the graphs counts as hung: a batch over a full submap takes a second."""
-FEATURES_LIMIT_S = 10.0
-"""After which the process that finds features counts as hung: networks take a second or two on a large image."""
+JOB_LIMIT_S = 30.0
+"""After which a process for graphs or features counts as hung: a full submap or a large image takes a second or two."""
 MAP_KINDS = (JobKind.START, JobKind.GRAPH)
 """Jobs of the live map's worker, in order. It keeps a state from job to job."""
 GRAPH_NICENESS, WALK_NICENESS = 3, 8
@@ -106,12 +104,12 @@ def worker_desk(config: Config, camera: Camera, faults: FaultScript, watch: Walk
         niceness=WALK_NICENESS,
     )
     live_map = Lane(
-        "map", MAP_KINDS, partial(map_handlers, config, camera.size_px), 1, GRAPH_LIMIT_S, niceness=GRAPH_NICENESS
+        "map", MAP_KINDS, partial(map_handlers, config, camera.size_px), 1, JOB_LIMIT_S, niceness=GRAPH_NICENESS
     )
     return WorkerDesk([live_map, walks], recovery.finish_wait_s, faults.kill_worker, watch)
 
 
 def features_beside(desk: WorkerDesk, config: FrontendConfig, painted: Callable[[Frame], Frame]) -> FeaturesBeside:
     """Start the process that finds the features of the frame to come."""
-    desk.open(Lane("features", (JobKind.FEATURES,), partial(feature_handlers, config), 1, FEATURES_LIMIT_S))
+    desk.open(Lane("features", (JobKind.FEATURES,), partial(feature_handlers, config), 1, JOB_LIMIT_S))
     return FeaturesBeside(desk, painted)

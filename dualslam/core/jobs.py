@@ -153,6 +153,8 @@ class Executor(Protocol):
 
 PAUSE_S = 1e-3
 """Between two looks at whether a job has ended, where a run waits for it."""
+MAX_WAITING = 8
+"""Jobs of a kind that may be open: with more the back end is behind, and they hold their snapshots in memory."""
 
 
 class InlineDesk:

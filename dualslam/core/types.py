@@ -297,6 +297,11 @@ class Track:
     n_by_pixels: int = 0
 
     @property
+    def seen_ids(self) -> IntArray:
+        """The landmarks that agree with the pose."""
+        return self.landmark_ids[self.landmark_ids >= 0]
+
+    @property
     def method(self) -> FrameMethod:
         """How the pose was found: `DIRECT` where pixels found most of the inliers."""
         if 2 * self.n_by_pixels > self.n_inliers:

@@ -21,6 +21,7 @@ from dualslam.core.config.settings import LinkingConfig
 from dualslam.core.decisions import Gate
 from dualslam.core.geometry import sim3
 from dualslam.core.geometry.alignment import Sim3Estimate, estimate_sim3_robust
+from dualslam.core.noise_model import MAJORITY
 from dualslam.core.types import BoolArray, Failure, FailureReason, FloatArray, IntArray
 from dualslam.linking import verify
 from dualslam.linking.correspondences import (
@@ -36,7 +37,6 @@ from dualslam.linking.gates import (
     MAX_HYPOTHESES,
     MAX_MISFITS,
     MAX_SCALE,
-    MIN_MAJORITY,
     MIN_PAIRS_PER_KEYFRAME,
     MINORITY_DEFORMATION,
     PAIR_CHI2,
@@ -254,7 +254,7 @@ def _link_over(overlap: _Overlap, before: IntArray, rng: Generator) -> LinkEstim
     # The walk has crossed the images of the newer keyframes, too.
     newest = max(old.keyframes) if limit is None else limit - 1
     share = smallest_share_handed_on(old, _look_back(old, int(agreeing[0])), newest)
-    if share < MIN_MAJORITY:
+    if share < MAJORITY:
         deformation = math.hypot(deformation, MINORITY_DEFORMATION)
     covariance = consensus.estimate.covariance + deformation_covariance(model, deformation)
     # The gates.

@@ -3,28 +3,20 @@
 from __future__ import annotations
 
 from dualslam.core.chi_square import CHI2_99
+from dualslam.core.noise_model import GROUP
 
-GATE_SIGMAS = 3.0
-"""Standard deviations at which such a comparison fails."""
 PAIR_CHI2 = CHI2_99[3]
 """Gate of a matched pair's squared Mahalanobis distance: chi-square, 3 degrees of freedom, 99 %."""
 PIXEL_CHI2 = CHI2_99[2]
 """Gate of a squared whitened reprojection residual: chi-square, 2 degrees of freedom, 99 %."""
-MIN_MAJORITY = 0.5
-"""Share of the matched landmarks in a keyframe, and of observations of a map, that must agree. Below a half those that
-disagree could hold a second similarity with more support."""
 MIN_PAIRS_PER_KEYFRAME = 8
 """Matched landmarks that a keyframe must hold to have a say (four fix a similarity with one to spare)."""
 MAX_MISFITS = 1
 """Keyframes in a row that may disagree before this counts as a change point: one can be wrong by itself."""
-DESCRIPTOR_RADIUS_PX = 3.0
-"""Distance in the same image within which two keypoints can be the same point: the detector's own scatter."""
 MIN_TIES = 10
 """Landmarks that keyframes on both sides of a place in the old map must see in agreement with their pixels. With fewer
 the old map is broken there, and its newer part counts as suspected."""
-TIE_WINDOW = 5
-"""Keyframes on either side that are searched for ties."""
-LOOK_BACK = 10
+LOOK_BACK = 2 * GROUP
 """Keyframes of the old map, older than the oldest shared one, among which a break is still looked for."""
 MINORITY_DEFORMATION = 0.03
 """Relative deformation (standard deviation) of a map beyond a place where it hands on fewer than half of what its

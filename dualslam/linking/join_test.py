@@ -12,18 +12,13 @@ from dataclasses import dataclass, field
 
 from dualslam.core.config.settings import LinkingConfig
 from dualslam.core.decisions import Gate
+from dualslam.core.noise_model import GATE_SIGMAS, MAJORITY, MAX_SLIP
 from dualslam.core.types import Failure, FailureReason
-from dualslam.linking.gates import GATE_SIGMAS
 from dualslam.linking.motion import Motion
 
 MAX_DRIFT, MAX_DRIFT_DEG, MAX_DRIFT_LOG_SCALE = 0.5, 60.0, math.log(3.0)
 """Largest drift of a map between two places, if it was never lost there: a share of the way, a turn, a log-scale. Two
 neighbouring copies of a thing are half the way apart. The largest drift of a real sequence is 47 % in scale."""
-MAX_SLIP = 0.1
-"""Share of the way that a map can have lost beyond what its turn and change of scale explain. 32 right loops (HoloLens,
-TUM, 7-Scenes, a phone) lost 3 % at most. The copy of a thing lies a period away, and is neither turned nor scaled."""
-NEARLY_AS_MUCH = 0.5
-"""Share of the first similarity's support. At a half, as for a majority, the better one no longer stands out."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -194,7 +189,7 @@ def drift_gate(share_of_way: float, turn_deg: float, log_scale: float) -> JoinGa
 
 def ambiguity_gate(support: int, first_support: int) -> JoinGate:
     """Return the gate of a second similarity, by the landmarks that it and the first one explain."""
-    compared = (Gate("second_support", support, "<", NEARLY_AS_MUCH * first_support),)
+    compared = (Gate("second_support", support, "<", MAJORITY * first_support),)
     detail = f"a second pose explains {support} landmarks, the first {first_support}"
     return JoinGate(compared, FailureReason.AMBIGUOUS_MODEL, detail, logged={"first_support": float(first_support)})
 

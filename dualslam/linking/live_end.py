@@ -22,6 +22,7 @@ import numpy as np
 from dualslam.core.config.settings import LinkingConfig
 from dualslam.core.estimates import PreferredCamera
 from dualslam.core.geometry import se3, sim3, so3
+from dualslam.core.noise_model import GROUP
 from dualslam.core.types import Failure, FailureReason, FloatArray, IntArray
 from dualslam.linking.estimate import LinkEstimate, LinkRefusal
 from dualslam.linking.gates import PIXEL_CHI2
@@ -31,8 +32,6 @@ from dualslam.map.submap import Submap
 
 MAX_KEYFRAMES = 60
 """Of a larger map so many keyframes are asked, at even spaces."""
-MIN_PLACE = 5
-"""Keyframes whose positions tell the scale of a place."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,7 +115,7 @@ def check_camera(
 def _places(ids: IntArray, agreeing: IntArray, live_since: int) -> tuple[IntArray, IntArray]:
     """Return, of a map's keyframes, those of the overlap, and those of the live end or next to it; ascending."""
     live = ids[ids >= live_since]
-    return ids[np.isin(ids, agreeing)], live if len(live) >= MIN_PLACE else ids[-MIN_PLACE:]
+    return ids[np.isin(ids, agreeing)], live if len(live) >= GROUP else ids[-GROUP:]
 
 
 def _log_spread(T: FloatArray, rows: IntArray) -> float:

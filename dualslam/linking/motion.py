@@ -19,13 +19,12 @@ import numpy as np
 
 from dualslam.atlas.trajectory import Path
 from dualslam.core.geometry import sim3
+from dualslam.core.noise_model import GATE_SIGMAS, MISSING_INTERVALS
 from dualslam.core.types import BoolArray, FloatArray, IntArray
 
 WINDOW_S = 0.3
 """Seconds over which a velocity is measured on either side, or `WINDOW_FRAMES`, if these take longer."""
 WINDOW_FRAMES = 4
-MISSING = 2.5
-"""Times the usual interval; frames further apart have others missing between them."""
 USUAL = 0.95
 """Quantile of the prediction's errors that counts as usual."""
 ALLOWED = 3.0
@@ -37,14 +36,9 @@ INDEPENDENT = 3.0
 GROWTH = 1.5
 """Power of time by which the error grows beyond what could be asked: that of a velocity that walks at random. On real
 sequences (hand, drone, car) the error grows with powers of 1.0 to 1.7 between 0.3 and 12 s."""
-DRIFT = 0.1
-"""Share of the way by which a map can have drifted between the place where two maps were matched and their seam. Right
-loops lost 3 % at most."""
 TAIL = 5
 """Frames at the end of a map that was lost: they may be wrong already."""
 
-JOIN_SIGMAS = 3.0
-"""Standard deviations by which the similarity that joins two maps may be off."""
 
 Slack = Callable[[int, int], float]
 """Uncertainty of a join at the seam between two frames, in the unit of the map."""
@@ -130,13 +124,13 @@ def join_slack(S_old_new: FloatArray, covariance: FloatArray, place: FloatArray)
     - `place` (3,): in the old map.
     """
     J = S_old_new[:3, :3] @ sim3.displacement(sim3.act(sim3.inverse(S_old_new), place[None])[0])
-    return JOIN_SIGMAS * float(np.sqrt(np.linalg.eigvalsh(J @ covariance @ J.T)[-1]))
+    return GATE_SIGMAS * float(np.sqrt(np.linalg.eigvalsh(J @ covariance @ J.T)[-1]))
 
 
 def gaps_of(times_s: FloatArray) -> IntArray:
     """Return the rows behind which frames are missing."""
     apart_s = np.diff(times_s)
-    return np.flatnonzero(apart_s > MISSING * np.median(apart_s)) if len(apart_s) else np.zeros(0, np.int64)
+    return np.flatnonzero(apart_s > MISSING_INTERVALS * np.median(apart_s)) if len(apart_s) else np.zeros(0, np.int64)
 
 
 def _seams(old: Path, new: Path) -> Iterator[tuple[Path, Path]]:
@@ -265,7 +259,7 @@ def _fit(t: FloatArray, centres: FloatArray, first: IntArray, end: IntArray, usu
     terms = np.column_stack([np.ones(len(t)), t, t**2, centres, t[:, None] * centres])
     sums = np.vstack([np.zeros(terms.shape[1]), np.cumsum(terms, axis=0)])
     n, s_t, s_tt, s_p, s_tp = np.split(sums[end] - sums[first], [1, 2, 3, 6], axis=1)
-    missing = np.concatenate([[0, 0], np.cumsum(np.diff(t) > MISSING * usual_s)])[: len(t) + 1]
+    missing = np.concatenate([[0, 0], np.cumsum(np.diff(t) > MISSING_INTERVALS * usual_s)])[: len(t) + 1]
     known = (n[:, 0] >= WINDOW_FRAMES) & (missing[end] == missing[np.minimum(first + 1, len(t))])
     spread = np.where(known[:, None], n * s_tt - s_t**2, 1.0)
     velocity = np.where(known[:, None], (n * s_tp - s_t * s_p) / spread, 0.0)

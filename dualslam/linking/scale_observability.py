@@ -18,11 +18,12 @@ from scipy import sparse
 from dualslam.core.geometry import se3
 from dualslam.core.geometry.alignment import COVARIANCE_INFLATION
 from dualslam.core.geometry.projection import project_points, projection_jacobians
+from dualslam.core.noise_model import GROUP
 from dualslam.core.sums import sum_by
 from dualslam.core.types import FloatArray, IntArray
 from dualslam.map.submap import Submap
 
-N_AROUND = 10
+N_AROUND = 2 * GROUP
 """Keyframes before and after the two places that hold them in shape: what lies farther off shares little with them."""
 N_GAUGE = 7
 """Directions of the poses that no observation fixes: a similarity of the whole."""

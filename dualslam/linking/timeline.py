@@ -12,16 +12,9 @@ import numpy as np
 
 from dualslam.core.config.settings import LinkingConfig
 from dualslam.core.geometry import se3, sim3, so3
+from dualslam.core.noise_model import GATE_SIGMAS, GROUP, MAJORITY
 from dualslam.core.types import BoolArray, FloatArray, IntArray
-from dualslam.linking.gates import (
-    GATE_SIGMAS,
-    MIN_MAJORITY,
-    MIN_PAIRS_PER_KEYFRAME,
-    MIN_TIES,
-    PAIR_CHI2,
-    PIXEL_CHI2,
-    TIE_WINDOW,
-)
+from dualslam.linking.gates import MIN_PAIRS_PER_KEYFRAME, MIN_TIES, PAIR_CHI2, PIXEL_CHI2
 from dualslam.linking.pairs import PairModel, pixel_chi2
 from dualslam.map.submap import Submap
 
@@ -55,7 +48,7 @@ def ask_keyframes(model: PairModel, S_old_new: FloatArray, config: LinkingConfig
     depth = np.array([np.median(distance[c.view_keyframe == k]) for k in range(len(c.keyframes))])
     reach = np.maximum(depth, np.linalg.norm(centres - model.centre_old, axis=1))
     bound = GATE_SIGMAS * config.deformation_sigma
-    agrees = (share > MIN_MAJORITY) & (rotation < bound) & (apart < bound * reach)
+    agrees = (share > MAJORITY) & (rotation < bound) & (apart < bound * reach)
     return KeyframeVotes(rotation, apart / reach, agrees, n >= MIN_PAIRS_PER_KEYFRAME)
 
 
@@ -95,7 +88,7 @@ def find_discontinuities(submap: Submap, oldest: int, newest: int) -> IntArray:
         followed = (seen[:, before].sum(1) >= 2) & (seen[:, after].sum(1) >= 2)
         if np.count_nonzero(followed) >= MIN_TIES:
             share = [good[followed, side].sum() / seen[followed, side].sum() for side in (before, after)]
-            torn[1, i] = min(share) <= MIN_MAJORITY
+            torn[1, i] = min(share) <= MAJORITY
             contrast[i] = abs(share[0] - share[1])
     # Windows that reach over a discontinuity disagree already beside it: of such neighbours the clearest is the place.
     for run in np.split(np.arange(len(ids)), np.flatnonzero(np.diff(torn[1].astype(int))) + 1):
@@ -126,7 +119,7 @@ def smallest_share_handed_on(submap: Submap, oldest: int, newest: int) -> float:
 
 def _windows(submap: Submap, oldest: int, newest: int) -> tuple[IntArray, list[tuple[int, slice, slice]]]:
     """Return keyframe ids, and of each place between the two given: its row, the rows before it, the rows after it."""
-    w = TIE_WINDOW
+    w = GROUP
     ids = np.array(sorted(submap.keyframes))
     first, last = int(np.searchsorted(ids, oldest, "right")), int(np.searchsorted(ids, newest, "right"))
     start = max(first - w, 0)

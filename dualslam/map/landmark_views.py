@@ -8,11 +8,9 @@ from dualslam.core.chi_square import variance_by_median
 from dualslam.core.geometry import se3
 from dualslam.core.geometry.projection import project_points, projection_jacobians
 from dualslam.core.geometry.triangulation import point_covariance, triangulate_n_view
+from dualslam.core.noise_model import MIN_LANDMARKS, PROOF_VIEWS
 from dualslam.core.types import FloatArray, IntArray
 from dualslam.map.submap import Submap
-
-MIN_LANDMARKS = 6
-"""Three fix a pose; twice as many tell how well."""
 
 
 def landmark_covariances(
@@ -94,7 +92,7 @@ def _views(submap: Submap, landmark_ids: IntArray, before: int | None) -> tuple[
 USUAL_NOISE = 0.33
 """Standard deviation of residuals, in the pixels' sigmas, for which the inflations of claims are made: that of plain
 stretches. In blurred ones it is 0.4 to 0.7."""
-MIN_VIEWS, MIN_RESIDUALS = 3, 10
+MIN_RESIDUALS = 10
 """What a keyframe's residuals are read from: landmarks of so many views, and so many of them. With less it is usual."""
 
 
@@ -106,7 +104,7 @@ def noise_excess(submap: Submap) -> dict[int, float]:
     for k, keyframe in submap.keyframes.items():
         feature = np.flatnonzero(submap.landmark_of[k] >= 0)
         ids = submap.landmark_of[k][feature]
-        feature, ids = feature[n_views[ids] >= MIN_VIEWS], ids[n_views[ids] >= MIN_VIEWS]
+        feature, ids = feature[n_views[ids] >= PROOF_VIEWS], ids[n_views[ids] >= PROOF_VIEWS]
         uv, _ = project_points(submap.K, se3.inverse(submap.T_submap_kf[k]), submap.landmarks["xyz_mu"][ids])
         features = keyframe.features
         chi2 = ((uv - features.uv_rect_px[feature]) ** 2).sum(axis=1) / features.sigma_px[feature] ** 2

@@ -10,14 +10,13 @@ from __future__ import annotations
 import numpy as np
 
 from dualslam.core.geometry import se3, sim3
+from dualslam.core.noise_model import GROUP
 from dualslam.core.types import FloatArray, IntArray
 from dualslam.map.submap import Submap
 from dualslam.map.submap_change import change_of_frame
 
 N_NEAREST = 3
 """Keyframes that a newer one follows: one alone may have been moved by its own noise."""
-N_SCALE = 5
-"""Of the newest ones that the estimate knows: by them the unit at the live end has changed."""
 
 
 def apply_late(
@@ -58,7 +57,7 @@ def _move_points(submap: Submap, before: Submap, known: IntArray, landmark_ids: 
     ids = np.flatnonzero(rest)
     if not len(ids):
         return
-    scale = float(sim3.scale(change_of_frame(before, submap, known[-N_SCALE:].tolist())))
+    scale = float(sim3.scale(change_of_frame(before, submap, known[-GROUP:].tolist())))
     all_ids = np.array(sorted(submap.keyframes), np.int64)
     place = np.searchsorted(all_ids, lm["first_kf"][ids]).clip(0, len(all_ids) - 1)
     S_cam = np.diag([scale, scale, scale, 1.0])

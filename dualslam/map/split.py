@@ -25,8 +25,7 @@ def next_submap(full: Submap, submap_id: int, n_shared: int, newest_id: int | No
     """
     shared = list(full.keyframes)[-n_shared:]
     if newest_id is not None:
-        ids = full.landmark_of[newest_id]
-        covisible = full.covisible(ids[ids >= 0])[0].tolist()
+        covisible = full.covisible(full.seen_in(newest_id))[0].tolist()
         if np.isin(shared, covisible).sum() < min(len(shared), len(covisible)) / 2:
             wanted = {newest_id, *covisible[:n_shared]}
             shared = [k for k in full.keyframes if k in wanted]

@@ -125,10 +125,9 @@ class Submap:
         return keyframe_id
 
     def living_keyframe(self, keyframe_id: int) -> int:
-        """Return a keyframe, the one that stands for it since it was culled, or the first where neither is known."""
-        while keyframe_id not in self.keyframes and keyframe_id in self.anchors:
-            keyframe_id = self.anchors[keyframe_id].keyframe_id
-        return keyframe_id if keyframe_id in self.keyframes else min(self.keyframes)
+        """`keyframe_for`, or the first keyframe where neither is known."""
+        is_known = keyframe_id in self.keyframes or keyframe_id in self.anchors
+        return self.keyframe_for(keyframe_id) if is_known else min(self.keyframes)
 
     def resolve_anchor(self, keyframe_id: int, T_kf_cam: FloatArray) -> FloatArray:
         """Return ``T_submap_cam`` of a frame posed relative to a keyframe, also if that keyframe was culled since."""
@@ -150,6 +149,15 @@ class Submap:
     def depths(self, landmark_ids: IntArray, T_cam_submap: FloatArray) -> FloatArray:
         """Return the depths (N,) of landmarks in a camera."""
         return np.asarray(self.landmarks["xyz_mu"][landmark_ids] @ T_cam_submap[2, :3] + T_cam_submap[2, 3])
+
+    def seen_in(self, keyframe_id: int) -> IntArray:
+        """Return the landmarks that a keyframe sees."""
+        ids = self.landmark_of[keyframe_id]
+        return ids[ids >= 0]
+
+    def depths_in(self, keyframe_id: int) -> FloatArray:
+        """Return their depths in its camera."""
+        return self.depths(self.seen_in(keyframe_id), se3.inverse(self.T_submap_kf[keyframe_id]))
 
     def add_landmarks(
         self, xyz_mu: FloatArray, descriptors: NDArray[Any], scale: FloatArray, keyframe_id: int
@@ -189,7 +197,7 @@ class Submap:
         """Take in which landmarks a frame should have shown, and which it did: the rarely found are culled."""
         if len(track.visible_ids):
             self.landmarks["n_visible"][track.visible_ids] += 1
-            self.landmarks["n_found"][track.landmark_ids[track.landmark_ids >= 0]] += 1
+            self.landmarks["n_found"][track.seen_ids] += 1
 
     def merge_landmarks(self, keep: IntArray, drop: IntArray) -> None:
         """Make each ``drop[i]`` one with ``keep[i]``: its observations move over, save where both are in a keyframe."""
@@ -332,16 +340,14 @@ class Submap:
         """Return by how many of some keyframes each landmark is seen, dead ones too."""
         n_seen = np.zeros(len(self.landmarks), np.int64)
         for k in keyframe_ids:
-            ids = self.landmark_of[k]
-            n_seen[ids[ids >= 0]] += 1
+            n_seen[self.seen_in(k)] += 1
         return n_seen
 
     def landmarks_of_keyframes(self, keyframe_ids: IntArray | list[int]) -> IntArray:
         """Return the ids of all live landmarks that any of the keyframes sees, ascending."""
         seen = np.zeros(len(self.landmarks), bool)
         for k in keyframe_ids:
-            ids = self.landmark_of[int(k)]
-            seen[ids[ids >= 0]] = True
+            seen[self.seen_in(int(k))] = True
         return np.flatnonzero(seen & self.landmarks["alive"])
 
     def observed_pixels(self, rows: IntArray) -> tuple[FloatArray, FloatArray]:

@@ -13,8 +13,9 @@ import numpy as np
 from dualslam.atlas.record import Record
 from dualslam.core.geometry import se3, sim3
 from dualslam.core.interfaces import VisualOdometry
+from dualslam.core.noise_model import SAME_WITHIN
 from dualslam.core.types import Failure, FloatArray, Track, View
-from dualslam.places.sightings import SAME_WITHIN, Relocalised, Search, Sighting, Sightings, median_depth, same_pose
+from dualslam.places.sightings import Relocalised, Search, Sighting, Sightings, median_depth, same_pose
 
 
 class Handover:

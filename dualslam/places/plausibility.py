@@ -9,11 +9,12 @@ import numpy as np
 from dualslam.atlas.atlas import Atlas
 from dualslam.atlas.record import Record
 from dualslam.atlas.trajectory import Path, compose
-from dualslam.core.geometry import se3, sim3
+from dualslam.core.geometry import sim3
+from dualslam.core.noise_model import MAX_SLIP, SAME_WITHIN
 from dualslam.core.types import Failure, FloatArray
 from dualslam.linking.join_test import LinkEvidence, drift_gate, judge_motion
-from dualslam.linking.motion import DRIFT, join_slack, seam_motions
-from dualslam.places.sightings import SAME_WITHIN, same_pose, turn_between
+from dualslam.linking.motion import join_slack, seam_motions
+from dualslam.places.sightings import same_pose, turn_between
 from dualslam.places.verification import PlaceMatch
 
 
@@ -23,7 +24,7 @@ def agree(atlas: Atlas, first: PlaceMatch, second: PlaceMatch) -> bool:
         return False
     T_q = atlas.submaps[second.query[0]].T_submap_kf[second.query[1]]
     poses = [sim3.act_on_pose(match.S_place_query, T_q) for match in (first, second)]
-    return same_pose(poses[0], poses[1], SAME_WITHIN * _depth(atlas, *second.place))
+    return same_pose(poses[0], poses[1], SAME_WITHIN * _depth(atlas, second))
 
 
 def contradict(atlas: Atlas, one: PlaceMatch, other: PlaceMatch) -> bool:
@@ -38,7 +39,7 @@ def contradict(atlas: Atlas, one: PlaceMatch, other: PlaceMatch) -> bool:
     T_q = atlas.submaps[one.query[0]].T_submap_kf[one.query[1]]
     centres = [sim3.act_on_pose(S_world[each.place[0]] @ each.S_place_query, T_q)[:3, 3] for each in (one, other)]
     apart = np.linalg.norm(centres[0] - centres[1])
-    return bool(apart > float(sim3.scale(S_world[m])) * _depth(atlas, *one.place))
+    return bool(apart > float(sim3.scale(S_world[m])) * _depth(atlas, one))
 
 
 def plausible(record: Record, match: PlaceMatch) -> PlaceMatch | Failure:
@@ -87,17 +88,15 @@ def reachable(record: Record, match: PlaceMatch) -> PlaceMatch | Failure:
     def slack(i: int, j: int) -> float:
         at_old, at_new = (i, j) if i in old.index else (j, i)
         way = old.way_between(k_a, at_old) + new.way_between(k_b, at_new)
-        return DRIFT * way + join_slack(match.S_place_query, match.covariance, new.centres[new.index == at_new][0])
+        return MAX_SLIP * way + join_slack(match.S_place_query, match.covariance, new.centres[new.index == at_new][0])
 
     refused = judge_motion(seam_motions(old, new, slack)).refusal()
     return match if refused is None else refused
 
 
-def _depth(atlas: Atlas, submap_id: int, keyframe_id: int) -> float:
-    """Return the median depth of what a keyframe sees, in its submap's unit."""
-    submap = atlas.submaps[submap_id]
-    ids = submap.landmark_of[keyframe_id]
-    return float(np.median(submap.depths(ids[ids >= 0], se3.inverse(submap.T_submap_kf[keyframe_id]))))
+def _depth(atlas: Atlas, match: PlaceMatch) -> float:
+    """Return the median depth of what a place's keyframe sees, in its submap's unit."""
+    return float(np.median(atlas.submaps[match.place[0]].depths_in(match.place[1])))
 
 
 def _way(atlas: Atlas, component: list[int], S_world: dict[int, FloatArray], first: int, last: int) -> float:

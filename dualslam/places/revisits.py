@@ -206,8 +206,7 @@ class Revisits:
         self, submap: Submap, keyframe_id: int, among: Collection[int] | None, of_other_run: bool
     ) -> Callable[[int, int], bool]:
         """Return which keyframes would be a revisit: not those that are tracked, or were a moment ago."""
-        ids = submap.landmark_of[keyframe_id]
-        seen_now = set(submap.covisible(ids[ids >= 0])[0].tolist())
+        seen_now = set(submap.covisible(submap.seen_in(keyframe_id))[0].tolist())
         arrived = sorted({k for m in self._record.atlas.submaps.values() for k in m.keyframes})
         at = arrived.index(keyframe_id)
         recent = {*arrived[max(at - RECENT, 0) : at + RECENT + 1], *seen_now} if not of_other_run else set()

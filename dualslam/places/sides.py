@@ -11,14 +11,10 @@ from numpy.typing import NDArray
 
 from dualslam.core.geometry import se3, sim3
 from dualslam.core.geometry.alignment import estimate_sim3_robust
+from dualslam.core.noise_model import GROUP, MIN_CONSENSUS, SAME_WITHIN
 from dualslam.core.place_matcher import PlaceMatcher, Sighting
 from dualslam.core.types import BoolArray, Failure, FloatArray, IntArray
 from dualslam.map.submap import Submap
-
-GROUP = 5
-"""Keyframes on a side: the one in question and the four that see most of the same landmarks."""
-MIN_FIRST_MATCHES = 12
-"""Matches between the two keyframes themselves, the best of the candidate's group: fewer, and no more is tried."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -74,12 +70,11 @@ class Looks:
 
 def side_of(submap: Submap, keyframe_id: int) -> Side:
     """Return a keyframe with those that see most of its landmarks."""
-    ids = submap.landmark_of[keyframe_id]
-    covisible, shared = submap.covisible(ids[ids >= 0])
+    covisible, shared = submap.covisible(submap.seen_in(keyframe_id))
     others = [
         k
         for k, n in zip(covisible.tolist(), shared.tolist(), strict=True)
-        if k != keyframe_id and k not in submap.condemned and n >= MIN_FIRST_MATCHES
+        if k != keyframe_id and k not in submap.condemned and n >= MIN_CONSENSUS
     ]
     keyframes = [keyframe_id, *others[: GROUP - 1]]
     return Side(submap, keyframes, submap.landmarks_of_keyframes(keyframes))
@@ -142,8 +137,6 @@ def sigmas_at_pairs(xyz_query: FloatArray, S: FloatArray, covariance: FloatArray
     }
 
 
-SAME_SHARE = 0.1
-"""Distance, of the size of what they move, within which two similarities are one: twice the 5 % of a wrong link."""
 N_ALIKE = 4
 """Landmarks of the other map that one landmark is paired with: the number of copies of a thing that can be
 distinguished."""
@@ -224,4 +217,4 @@ def _are_one(S_a: FloatArray, S_b: FloatArray, src: FloatArray) -> bool:
     """Whether two similarities do the same to points, by what counts as a wrong link (`LinkingConfig`)."""
     moved_a, moved_b = sim3.act(S_a, src), sim3.act(S_b, src)
     size = np.sqrt(((moved_a - moved_a.mean(0)) ** 2).sum(1).mean())
-    return bool(np.sqrt(((moved_a - moved_b) ** 2).sum(1).mean()) < SAME_SHARE * size)
+    return bool(np.sqrt(((moved_a - moved_b) ** 2).sum(1).mean()) < SAME_WITHIN * size)

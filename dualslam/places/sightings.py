@@ -10,8 +10,9 @@ import numpy as np
 from dualslam.atlas.record import FrameStamp, Record
 from dualslam.core.config.settings import Config
 from dualslam.core.events import EventKind
-from dualslam.core.geometry import se3
+from dualslam.core.geometry import se3, so3
 from dualslam.core.interfaces import Seeker, SubmapGraph
+from dualslam.core.noise_model import SAME_WITHIN
 from dualslam.core.support import judge_track
 from dualslam.core.types import Failure, FailureReason, FloatArray, Track, View
 from dualslam.map.submap import Submap
@@ -23,9 +24,6 @@ N_CONFIRMING = 2
 """Keyframes (or frames) that must say the same as the first: three with it, where evidence begins for a link too."""
 YOUNG = 5
 """Newest keyframes of the live submap whose own landmarks are not remembered yet: half of them will be culled."""
-SAME_WITHIN = 0.1
-"""Where two similarities put the camera, of the scene's depth, within which they say the same: twice the 5 % that makes
-a link a wrong one."""
 SAME_TURN_RAD = float(np.radians(6.0))
 """The same for its rotation: twice 3 degrees."""
 
@@ -208,12 +206,12 @@ def record_refusal(
 
 def median_depth(submap: Submap, track: Track) -> float:
     """Return how far away is what a frame was tracked by, in the submap's unit."""
-    return float(np.median(submap.depths(track.landmark_ids[track.landmark_ids >= 0], track.T_cam_submap)))
+    return float(np.median(submap.depths(track.seen_ids, track.T_cam_submap)))
 
 
 def turn_between(T_a: FloatArray, T_b: FloatArray) -> float:
     """Return the angle between two poses, radians."""
-    return float(np.arccos(np.clip((np.trace(T_a[:3, :3].T @ T_b[:3, :3]) - 1) / 2, -1, 1)))
+    return float(so3.rotation_angle(T_a[:3, :3].T @ T_b[:3, :3]))
 
 
 def same_pose(T_a: FloatArray, T_b: FloatArray, within: float) -> bool:

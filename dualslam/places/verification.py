@@ -23,21 +23,14 @@ from numpy.random import Generator
 from dualslam.core.config.settings import LinkingConfig
 from dualslam.core.geometry import se3, sim3
 from dualslam.core.geometry.alignment import Sim3Estimate, estimate_sim3_robust
+from dualslam.core.noise_model import MAJORITY, MIN_CONSENSUS, PROOF_VIEWS
 from dualslam.core.place_matcher import PlaceMatcher, Sighting
 from dualslam.core.types import Failure, FailureReason, Features, FloatArray, IntArray
-from dualslam.linking.gates import (
-    MAX_HYPOTHESES,
-    MAX_SCALE,
-    MIN_IMAGE_SPREAD,
-    MIN_MAJORITY,
-    MIN_PAIRS_PER_KEYFRAME,
-    PAIR_CHI2,
-)
+from dualslam.linking.gates import MAX_HYPOTHESES, MAX_SCALE, MIN_IMAGE_SPREAD, MIN_PAIRS_PER_KEYFRAME, PAIR_CHI2
 from dualslam.linking.join_test import JoinGate, LinkEvidence, ambiguity_gate, similarity_gates, support_gate
 from dualslam.map.landmark_views import landmark_covariances
 from dualslam.map.submap import Submap
 from dualslam.places.sides import (
-    MIN_FIRST_MATCHES,
     Looks,
     Pairs,
     SecondSimilarity,
@@ -54,9 +47,6 @@ from dualslam.places.sides import (
 
 N_MATCHED = 3
 """Of a side's keyframes, how many are matched with all of the other side's: matching is quadratic."""
-MIN_KEYFRAMES = 3
-"""Keyframes on either side that must see the agreeing landmarks: two fix a shape of their own, evidence starts with
-the third."""
 SEARCH_RADIUS_PX = 8.0
 """About where a landmark should be under a similarity of some tens of pairs: its error, and the maps' own drift."""
 NEAR_FIRST = 4.0
@@ -146,8 +136,8 @@ class PlaceVerifier:
         if query[0] is place[0] and set(query_side.keyframes) & set(place_side.keyframes):
             return Failure(FailureReason.DEGENERATE, "the two places see the same landmarks already")
         n = min(len(query_side.keyframes), len(place_side.keyframes))
-        if n < MIN_KEYFRAMES:
-            detail = f"{n} keyframes about a place, {MIN_KEYFRAMES} needed on either side"
+        if n < PROOF_VIEWS:
+            detail = f"{n} keyframes about a place, {PROOF_VIEWS} needed on either side"
             return Failure(FailureReason.AGREEMENT, detail, {"n_keyframes": float(n)})
         return place_side, query_side
 
@@ -159,10 +149,10 @@ class PlaceVerifier:
             for k in place.keyframes:
                 votes.append(self._match_keyframes(place.submap, k, query.submap, q))
                 most = max(most, len(votes[-1][0]))
-                if 2 * most < MIN_FIRST_MATCHES:
+                if 2 * most < MIN_CONSENSUS:
                     break  # what the place itself hardly shares, its neighbours do not either
-            if n == 0 and most < MIN_FIRST_MATCHES:
-                detail = f"{most} matches with the place, {MIN_FIRST_MATCHES} needed"
+            if n == 0 and most < MIN_CONSENSUS:
+                detail = f"{most} matches with the place, {MIN_CONSENSUS} needed"
                 return Failure(FailureReason.TOO_FEW_MATCHES, detail, {"n_matches": float(most)})
         return self._place_pairs(place.submap, query.submap, *one_to_one(votes))
 
@@ -250,8 +240,8 @@ class PlaceVerifier:
         agree = f"{n} of {len(inliers)} pairs agree"
         covered = f"{spread:.0%} of the image is covered"
         gates = [
-            JoinGate.at_least("inlier_ratio", share, MIN_MAJORITY, FailureReason.LOW_INLIER_RATIO, agree),
-            support_gate(min(len(keyframes_place), len(keyframes_query)), MIN_KEYFRAMES),
+            JoinGate.at_least("inlier_ratio", share, MAJORITY, FailureReason.LOW_INLIER_RATIO, agree),
+            support_gate(min(len(keyframes_place), len(keyframes_query)), PROOF_VIEWS),
             _found_gate(found, own),
             JoinGate.at_least("spread", spread, MIN_IMAGE_SPREAD, FailureReason.SPREAD, covered),
             *similarity_gates(*known, self._config),
@@ -282,8 +272,7 @@ class PlaceVerifier:
 
     def _second_pose(self, place: Side, query: Side, S: FloatArray, rng: Generator) -> SecondSimilarity | None:
         """Look for another similarity among all similar landmarks, in the place and in the query keyframe."""
-        ids = query.submap.landmark_of[query.keyframes[0]]
-        asked = np.unique(ids[ids >= 0])
+        asked = np.unique(query.submap.seen_in(query.keyframes[0]))
         theirs, ours = query.submap.landmarks["descriptor"], place.submap.landmarks["descriptor"]
         i, j = alike(theirs[asked], ours[place.landmarks], self._matcher)
         xyz_query, cov_query = self._points(query.submap, asked)

@@ -9,9 +9,9 @@ from functools import partial
 import numpy as np
 
 from dualslam.core.geometry import sim3
+from dualslam.core.noise_model import GROUP
 from dualslam.core.types import Failure
 from dualslam.linking import LinkEstimate, LinkRefusal, check_camera, propagate_to_live_end
-from dualslam.linking.gates import TIE_WINDOW
 from dualslam.linking.rivals import choose_by_velocity
 from dualslam.map.submap import Submap
 from dualslam.recovery.job import FoundLink, RecoveryParts
@@ -99,7 +99,7 @@ class Relinker:
     def _stays_torn(self, refused: LinkRefusal) -> bool:
         """Whether the growing submap is torn where all keyframes are there that are asked about the place."""
         torn_at = refused.torn_at
-        return torn_at is not None and sum(k < torn_at for k in self._submap.keyframes) >= TIE_WINDOW
+        return torn_at is not None and sum(k < torn_at for k in self._submap.keyframes) >= GROUP
 
     def _is_due(self, old_id: int, n_shared: int) -> bool:
         if n_shared < MIN_SHARED_KEYFRAMES:

@@ -17,12 +17,13 @@ from dualslam.atlas.endings import part_off
 from dualslam.atlas.record import FrameStamp, Record
 from dualslam.core.config.settings import LinkingConfig
 from dualslam.core.events import EventKind
+from dualslam.core.noise_model import GROUP
 from dualslam.core.types import IntArray
 from dualslam.linking.scale_observability import N_AROUND, answer_scale
 from dualslam.map.landmark_views import noise_excess
 from dualslam.map.split import submap_of
 from dualslam.map.submap import Submap
-from dualslam.recovery.scale_watch import FIRM_TIES, GROUP, SCALE_INFLATION, count_ties, lost_from, question_about
+from dualslam.recovery.scale_watch import FIRM_TIES, SCALE_INFLATION, count_ties, lost_from, question_about
 
 SPAN = 2
 """Groups of keyframes across which the scale is asked for: a blurred turn may take longer than one, and hand on a

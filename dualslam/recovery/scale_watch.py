@@ -18,14 +18,12 @@ from scipy.special import ndtri
 from dualslam.atlas.atlas import Link
 from dualslam.core.config.settings import LinkingConfig
 from dualslam.core.jobs import Desk, Handlers, InlineDesk, JobKind
+from dualslam.core.noise_model import GROUP
 from dualslam.core.types import Failure, FloatArray, IntArray
 from dualslam.linking.gates import PIXEL_CHI2
 from dualslam.linking.scale_observability import N_AROUND, ScaleQuestion, answer_scale, ask_scale
 from dualslam.map.submap import Submap
 
-GROUP = 5
-"""Keyframes over which the scale is handed on from those before to those after: about as long as a landmark lives on a
-road, so that it is not the same ones that both see."""
 SCALE_INFLATION = 1.8
 """Errors of neighbouring pixels and views are alike, and do not average out as the sigmas suppose. Chosen so that what
 is true comes to what is claimed on plain stretches (`benchmarks/covariances.py`, seeds 1 to 3)."""

@@ -11,12 +11,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from dualslam.core.geometry import se3
+from dualslam.core.noise_model import GROUP
 from dualslam.core.types import FloatArray
 from dualslam.linking.gates import PIXEL_CHI2
 from dualslam.linking.scale_observability import scale_sigmas_between
 from dualslam.map.landmark_views import landmark_covariances, noise_excess, resection_covariance
 from dualslam.map.submap import Submap
-from dualslam.recovery.scale_watch import GROUP, SCALE_INFLATION
+from dualslam.recovery.scale_watch import SCALE_INFLATION
 
 TOGETHER = 2
 """Groups that are asked of one set of normal equations, which takes little longer than for one. With more the sigmas

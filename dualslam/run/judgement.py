@@ -9,7 +9,7 @@ import numpy as np
 
 from dualslam.core.estimates import MAX_PRIOR_SIGMAS
 from dualslam.core.events import EventKind
-from dualslam.core.geometry import se3, sim3
+from dualslam.core.geometry import sim3
 from dualslam.core.trajectory import Trajectory
 from dualslam.core.types import FrameStatus
 from dualslam.map.frame_records import FrameRow
@@ -159,9 +159,7 @@ def _median_depth(system: System, trajectories: Trajectories, index: int) -> flo
     """Return the median depth of what a frame's keyframe sees, in the unit of the main map."""
     pose = system.poses[system.numbers.number_of(index)]
     submap = system.atlas.submaps[pose.submap_id]
-    k = submap.keyframe_for(pose.keyframe_id)
-    ids = submap.landmark_of[k]
-    depths = submap.depths(ids[ids >= 0], se3.inverse(submap.T_submap_kf[k]))
+    depths = submap.depths_in(submap.keyframe_for(pose.keyframe_id))
     scale = float(sim3.scale(trajectories.S_world_submap[pose.submap_id]))
     return scale * float(np.median(depths)) if len(depths) else 0.0
 

@@ -17,19 +17,15 @@ from dualslam.core.chi_square import CHI2_90, CHI2_9999
 from dualslam.core.config.settings import HealthConfig
 from dualslam.core.estimates import KeyframeReport
 from dualslam.core.geometry import se3
+from dualslam.core.noise_model import GATE_SIGMAS, MAJORITY
 from dualslam.core.quantiles import quantile
 from dualslam.core.support import judge_track
 from dualslam.core.types import Failure, FailureReason, FloatArray, Track
 
-MAJORITY = 0.5
-"""Early sign: share of the matches below which those that disagree could hold another pose."""
 JUMP_CHI2 = CHI2_9999[6]
 """Early sign: squared Mahalanobis distance of a pose from the motion model's, above its level there: chi-square, 6
 degrees of freedom, 99.99 % (what drivers and hands do has heavier tails than a Gaussian). The covariance is that of the
 pose plus the motion model's own error in the last frames."""
-SIGN_SIGMAS = 3.09
-"""Early sign: standard deviations of a chi-square over its degrees of freedom, above its level as a rule (one-sided
-99.9 %)."""
 MAX_KEYFRAME_CHI2 = 2.0
 """Early sign: chi-square of the graph's newest factors over its degrees of freedom, relative to that level. They hold
 outliers that no one has sorted out yet, and no quantile is known for them."""
@@ -41,7 +37,7 @@ to be corrupted. Signs on up to one healthy frame in five then add up to nothing
 
 MEMORY_FRAMES = 300
 """Verdicts that are kept: no suspected stretch reaches back farther than the frame buffer."""
-TAIL, TAIL_SIGMAS = 0.9, 1.645
+TAIL, TAIL_SIGMAS = 0.9, math.sqrt(CHI2_90[1])
 """A quantile, and where it lies for the size of a Gaussian (in sigmas)."""
 MIN_INNOVATIONS = 8
 """Frames before which the motion model's error is not known."""
@@ -140,7 +136,7 @@ class HealthMonitor:
         if jump2 > JUMP_CHI2 * _level(self._jump, CHI2_90[6], TAIL):
             signs.append(FailureReason.MOTION_JUMP)
         dof = max(2 * track.n_inliers - 6, 1)
-        if track.chi2 > _level(self._chi2, 1.0) * (1 + SIGN_SIGMAS * math.sqrt(2 / dof)):
+        if track.chi2 > _level(self._chi2, 1.0) * (1 + GATE_SIGMAS * math.sqrt(2 / dof)):
             signs.append(FailureReason.CHI_SQUARE)
         return tuple(signs)
 

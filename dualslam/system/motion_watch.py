@@ -8,9 +8,10 @@ import numpy as np
 
 from dualslam.atlas.record import FrameStamp, Record
 from dualslam.atlas.trajectory import Path
+from dualslam.core.noise_model import MISSING_INTERVALS
 from dualslam.core.types import Failure
 from dualslam.linking.join_test import judge_motion
-from dualslam.linking.motion import MISSING, WINDOW_FRAMES, WINDOW_S, step_motions
+from dualslam.linking.motion import WINDOW_FRAMES, WINDOW_S, step_motions
 from dualslam.map.submap import Submap
 
 HISTORY_S = 30.0
@@ -61,7 +62,7 @@ class MotionWatch:
             return None
         self.end()
         # Reverse tracking may have posed frames before the first one: the gap is before these.
-        missing = np.flatnonzero(np.abs(np.diff(times_s[: place + 1])) > MISSING * usual_s)
+        missing = np.flatnonzero(np.abs(np.diff(times_s[: place + 1])) > MISSING_INTERVALS * usual_s)
         if not len(missing):
             return None
         last_before = poses[int(missing[-1])]

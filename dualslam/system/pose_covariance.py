@@ -16,13 +16,11 @@ from scipy.sparse import bsr_array
 from dualslam.core.geometry import se3
 from dualslam.core.geometry.projection import projection_jacobians
 from dualslam.core.interfaces import VisualOdometry
+from dualslam.core.noise_model import BASELINE_SIGMA, MIN_LANDMARKS
 from dualslam.core.sums import sum_by
 from dualslam.core.types import FloatArray, IntArray, Track
-from dualslam.map.landmark_views import MIN_LANDMARKS
 from dualslam.map.submap import NO_LANDMARK, Submap
 
-BASELINE_SIGMA = 1e-4
-"""Of the first baseline, relative to its length: as in the submap's graph."""
 LOOSE_INFORMATION = 1e-6
 """Of a prior on each pose (rad, units of the submap): where nothing is seen the answer is large, not infinite."""
 MIN_EIGENVALUE = 1e-8

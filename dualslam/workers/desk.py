@@ -22,7 +22,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from dualslam.core.errors import ConfigError
-from dualslam.core.jobs import Ended, JobKind, Limit
+from dualslam.core.jobs import MAX_WAITING, PAUSE_S, Ended, JobKind, Limit
 from dualslam.core.types import Failure, FailureReason
 from dualslam.workers.worker import STOP_S, Answer, MakeHandlers, Worker
 
@@ -31,12 +31,8 @@ log = logging.getLogger(__name__)
 
 START_S = 60.0
 """How long a run in real time waits for its workers at most: seconds on a free machine."""
-PAUSE_S = 0.01
-"""Between two looks at whether the last jobs have ended, when nothing else is left to do."""
 MAX_STILLBORN = 3
 """Workers in a row that may end before they were ready: memory may be short for a moment; a script stays wrong."""
-MAX_WAITING = 8
-"""Jobs of a kind that may wait: more are nothing but a back end that is behind, and hold their snapshots in memory."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -13,7 +13,7 @@ from collections import defaultdict
 from collections.abc import Callable, Iterable
 from typing import Any
 
-from dualslam.core.jobs import PAUSE_S, Ended, Executor, JobKind, Limit
+from dualslam.core.jobs import MAX_WAITING, PAUSE_S, Ended, Executor, JobKind, Limit
 from dualslam.core.schedule import (
     AT_END,
     AT_ONCE,
@@ -29,8 +29,6 @@ from dualslam.core.schedule import (
 )
 from dualslam.core.types import Failure, FailureReason
 
-MAX_OPEN = 8
-"""Jobs of a kind that may be open: with more the back end is behind, and they hold their snapshots in memory."""
 UNANSWERED = frozenset({JobKind.FORESIGHT})
 """Kinds whose results stay where they were made: they only save time."""
 
@@ -121,8 +119,8 @@ class ScheduledDesk:
         if record is not None and record.is_lost:
             self._arrived[request.number] = Ended(request.work, record.failure())
             self.executor.lose(request.kind)
-        elif self.n_open(request.kind) > MAX_OPEN:
-            detail = f"{MAX_OPEN} jobs of the kind {request.kind} are open already"
+        elif self.n_open(request.kind) > MAX_WAITING:
+            detail = f"{MAX_WAITING} jobs of the kind {request.kind} are open already"
             self._give(request, Ended(request.work, Failure(FailureReason.BUSY, detail)))
         else:
             limit = Limit(after_s=self._budget_s) if self._is_live else Limit()

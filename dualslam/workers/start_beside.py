@@ -9,13 +9,11 @@ from dataclasses import dataclass, replace
 from itertools import count
 
 from dualslam.core.errors import ConfigError
-from dualslam.core.interfaces import MapStarter
+from dualslam.core.interfaces import START_REACH, MapStarter
 from dualslam.core.jobs import Desk, JobKind
 from dualslam.core.types import Failure, FailureReason, FloatArray, Frame, Start, View
 from dualslam.workers.desk import WorkerDesk
 
-MAX_VIEWS = 128
-"""Frames that can be sent once more, to a process that takes the place of another: a start looks no farther back."""
 LOST = (FailureReason.WORKER, FailureReason.TIMEOUT, FailureReason.BUSY)
 """Ends of a search with which what was collected is lost, too."""
 _SESSIONS = count()
@@ -71,7 +69,7 @@ class StartBeside:
         self._starter = starter
         self._K = K
         self._session = next(_SESSIONS)
-        self._views: deque[View] = deque(maxlen=MAX_VIEWS)
+        self._views: deque[View] = deque(maxlen=START_REACH + 1)
         self._n_new = 0  # of these, the last ones, that the process does not know
 
     def collect(self, view: View) -> None:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from dualslam.core.chi_square import CHI2_95
 from dualslam.core.conformance import expect
 from dualslam.core.interfaces import Frontend
 from dualslam.core.types import BoolArray, Features, FloatArray, IntArray, Matches
@@ -15,8 +16,6 @@ from dualslam.frontends.features.matching import FeatureGrid, match_projected
 
 MIN_MATCHES = 30
 MIN_RIGHT = 0.9
-GATE_95 = 1.96
-"""Of a Gaussian, 95 % lie within so many sigmas."""
 SIGMA_RATIO = (1 / 6, 1.3)
 """The residuals' 95 % over that of the sigmas claimed. Above, gates at 95 % would lose more than one right match in
 eight. Far below is honest: a clean print is the best case, and real views differ by more than their homography. ORB's
@@ -173,7 +172,7 @@ def check_noise_model(subject: Subject) -> None:
         scale = views.a.scale[views.matches.index[views.right, 0]]
         middle = np.median(scale)
         for part, which in (("fine", scale <= middle), ("coarse", scale >= middle)):
-            ratio = float(np.quantile(whitened[which], 0.95)) / GATE_95
+            ratio = float(np.quantile(whitened[which], 0.95)) / np.sqrt(CHI2_95[1])
             low, high = SIGMA_RATIO
             expect(ratio < high, f"residuals of {part} features are {ratio:.1f} times as large as sigma_px says")
             expect(ratio > low, f"residuals of {part} features are {1 / ratio:.0f} times as small as sigma_px says")

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from dualslam.core.camera.base import Camera
 from dualslam.core.geometry import se3
 from dualslam.core.types import BoolArray, FloatArray, IntArray
-from dualslam.frontends.direct.patches import HALF, Patches, Smear
-from dualslam.frontends.direct.warp import Pyramid, correlate, inside, project_with_jacobians, sample
+from dualslam.frontends.direct.patches import Patches, Smear
+from dualslam.frontends.direct.warp import HALF, Pyramid, correlate, inside, project_with_jacobians, sample
 
 INNER = HALF - 1
 N_ITERATIONS = 8

@@ -18,11 +18,9 @@ from dualslam.core.pixels import PixelMatches, PosedImage
 from dualslam.core.types import FloatArray
 from dualslam.frontends.direct.alignment import agreement, align, shift
 from dualslam.frontends.direct.patches import MAX_LEVELS, SHARP, Patches, Smear, patches_of, smears
-from dualslam.frontends.direct.warp import Pyramid, build_pyramid, correlate, project_with_jacobians, sample
+from dualslam.frontends.direct.warp import AGREES, Pyramid, build_pyramid, correlate, project_with_jacobians, sample
 from dualslam.frontends.registry import MATCHERS, parse_options
 
-AGREES = 0.7
-"""Correlation of a patch that is where the pose puts it, as in the photometric audit."""
 COARSE, SMEAR_LEVEL = (4, 3), 2
 """Levels of the pyramid for the first poses, and the one at which the smear is found."""
 BETTER = 0.02

@@ -12,12 +12,19 @@ from dualslam.core.camera.base import Camera
 from dualslam.core.geometry import se3
 from dualslam.core.geometry.projection import project_points
 from dualslam.core.types import FloatArray, IntArray, View
-from dualslam.frontends.direct.warp import build_pyramid, correlate, inside, sample, warp_points
+from dualslam.frontends.direct.warp import (
+    AGREES,
+    HALF,
+    MIN_CONTRAST,
+    build_pyramid,
+    correlate,
+    inside,
+    sample,
+    warp_points,
+)
 from dualslam.frontends.tracking.row_shifts import find_as_read
 from dualslam.map.submap import NO_LANDMARK, Submap
 
-HALF = 4
-"""Half the side of a patch, in its own pixels: 9 x 9 of them."""
 SPACING_PX = 2.0
 """Pixels of the image per pixel of a patch: half the resolution tolerates an error of a pixel."""
 N_PATCHES = 120
@@ -27,15 +34,11 @@ N_KEYFRAMES = 60
 MAX_AGE_S = 0.8
 """Of the keyframe that a frame is compared with, where there is such a one. Over longer times a camera in a hand sees
 surfaces from other sides, and walls hide others: of a right map's patches none may be left."""
-MIN_CONTRAST = 4.0
-"""Standard deviation of a patch's grey values: less is noise."""
 MAX_ZOOM = 2.0
 """Change of size that the patch's plane, taken parallel to the image, tolerates."""
 MIN_IN_VIEW = 0.3
 """Share of a keyframe's patches that a frame must be able to show to be compared with it."""
 MIN_PATCHES = 25
-AGREES = 0.7
-"""Correlation of a patch that is where the pose puts it: noise and blur leave this much; another place seldom has."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -13,7 +13,7 @@ from dualslam.core.camera.base import Camera
 from dualslam.core.geometry import se3
 from dualslam.core.pixels import PosedImage
 from dualslam.core.types import BoolArray, FloatArray, IntArray
-from dualslam.frontends.direct.warp import Pyramid, build_pyramid, inside, sample
+from dualslam.frontends.direct.warp import HALF, Pyramid, build_pyramid, inside, sample
 
 MIN_LENGTH_PX = 1.2
 """Shorter smears leave an image as it is."""
@@ -72,8 +72,6 @@ def _line(angle_rad: float, length_px: float) -> NDArray[np.float32] | None:
     return np.asarray(kernel / kernel.sum(), np.float32)
 
 
-HALF = 4
-"""Half the side of a patch, in pixels of its level: 9 x 9 of them, 7 x 7 of which have gradients."""
 MAX_LEVELS = 5
 MIN_CONTRAST = 3.0
 """Standard deviation of a patch's greys: less is noise."""

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dualslam.core.types import FloatArray, IntArray
-from dualslam.frontends.direct.warp import Pyramid, sample
+from dualslam.frontends.direct.warp import MIN_CONTRAST, Pyramid, sample
 
 HALF_PX = 6
 """Half the side of a patch, in pixels of the coarser image."""
@@ -26,8 +26,6 @@ MAX_RIVAL = 0.9
 """Correlation of the best place that is not beside the peak, relative to the peak's."""
 BESIDE_PX = 2
 """Places so far from the peak belong to it."""
-MIN_CONTRAST = 4.0
-"""Standard deviation of a patch's greys: less is noise."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

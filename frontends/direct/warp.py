@@ -18,6 +18,12 @@ from dualslam.core.types import BoolArray, FloatArray
 Pyramid = list[NDArray[np.float32]]
 
 MAX_LEVELS = 4
+HALF = 4
+"""Half the side of a patch, in its own pixels: 9 x 9 of them."""
+AGREES = 0.7
+"""Correlation of a patch that is where the pose puts it: noise and blur leave this much; another place seldom has."""
+MIN_CONTRAST = 4.0
+"""Standard deviation of greys: sensors have a noise of 1 to 3, and blank images have that alone."""
 MIN_SIDE_PX = 48
 """An image with a shorter side is not halved again."""
 REMAP_ROWS = 30000
@@ -50,12 +56,14 @@ def build_pyramid(image: NDArray[np.uint8], max_levels: int = MAX_LEVELS) -> Pyr
 
 
 def warp_points(camera: Camera, uv_px: FloatArray, depth: FloatArray, T_b_a: FloatArray) -> Warp:
-    """Warp pixels (N, 2) of view a, at depths (N,), into view b of the same camera."""
+    """Warp pixels (N, 2) of view a, at depths (N,), into view b of the same camera; `T_b_a` (4, 4), or one for each."""
     n = len(uv_px)
     # One call for all: taking a lens out costs more by the call than by the pixel.
     rays = camera.unproject((uv_px + np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])[:, None]).reshape(-1, 2))
     p = rays * (np.tile(depth, 3) / rays[:, 2])[:, None]
-    p_b = p @ T_b_a[:3, :3].T + T_b_a[:3, 3]
+    R, t = T_b_a[..., :3, :3], T_b_a[..., :3, 3]
+    moved = p @ R.T if R.ndim == 2 else np.einsum("nij,snj->sni", R, p.reshape(3, n, 3))
+    p_b = (moved + t).reshape(-1, 3)
     here, right, down = camera.project(p_b).reshape(3, n, 2)
     rect, rect_b = (plane(x[:n]) * np.diag(camera.K)[:2] + camera.K[:2, 2] for x in (rays, p_b))
     return Warp(rect, here, rect_b, np.stack([right - here, down - here], axis=2))

@@ -13,6 +13,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from dualslam.core.firsts import rank_in_runs
+from dualslam.core.noise_model import GATE_SIGMAS
 from dualslam.core.types import BoolArray, FloatArray, IntArray
 
 FAST_RADIUS_PX = 3
@@ -25,9 +26,6 @@ _DOG_REACH_PX = 6
 """Radius of the filter."""
 _DOG_CURVATURE_NOISE = 0.165
 """Standard deviation of the filter's second difference along an axis, relative to that of white noise in the image."""
-_STANDS_OUT_SIGMAS = 3.0
-"""By so many the least curvature of a peak differs from none. Of the corners of noise alone 3 % reach that: FAST
-chooses the boldest."""
 
 _ROW_BITS = 24
 _ROW_MASK = (1 << _ROW_BITS) - 1
@@ -161,7 +159,7 @@ def stand_out(peaks: Peaks, noise: FloatArray) -> BoolArray:
     `noise` (N,) float64: its standard deviation about each of them, grey levels.
     """
     least = _least_curvature(peaks.response)
-    return np.asarray(least > _STANDS_OUT_SIGMAS * _DOG_CURVATURE_NOISE * noise)
+    return np.asarray(least > GATE_SIGMAS * _DOG_CURVATURE_NOISE * noise)
 
 
 def _peaks(patches: NDArray[np.uint8]) -> tuple[NDArray[np.float32], IntArray]:

@@ -18,14 +18,13 @@ from dualslam.core.chi_square import CHI2_95
 from dualslam.core.geometry import se3
 from dualslam.core.geometry.triangulation import in_front, triangulate_n_view
 from dualslam.core.interfaces import Frontend
+from dualslam.core.noise_model import MAX_DEPTH_SIGMA
 from dualslam.core.types import BoolArray, Failure, FailureReason, Features, FloatArray, IntArray, Matches, View
 from dualslam.frontends.features.image_features import ImageFeatures
 from dualslam.frontends.tracking.row_shifts import correct_shutter
 from dualslam.map.submap import Submap
 
 NO_TRACK = -1
-MAX_DEPTH_SIGMA = 0.25
-"""Relative uncertainty of its depth up to which a point serves to find a pose (as for landmarks in the graph)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

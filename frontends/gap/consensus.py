@@ -18,9 +18,9 @@ from dualslam.core.geometry import se3
 from dualslam.core.geometry.projection import project_points, projection_jacobians
 from dualslam.core.geometry.triangulation import triangulate_two_view
 from dualslam.core.geometry.two_view import fundamental_from_pose, sampson_distance
+from dualslam.core.noise_model import MIN_CONSENSUS
 from dualslam.core.types import BoolArray, Features, FloatArray, IntArray, Rival
 from dualslam.frontends.gap.relocalisation import GapPose
-from dualslam.frontends.tracking.resection import MIN_CONSENSUS
 
 CONFIRMING_SHARE = 0.85
 """Of what two frames beyond a gap both see must agree with their poses. Of two right ones on rendered streets 95 to

@@ -31,6 +31,7 @@ from dualslam.core.geometry import se3
 from dualslam.core.interfaces import SubmapGraph
 from dualslam.core.support import judge_track
 from dualslam.core.types import Failure, FailureReason, FloatArray, Rival, Track, View
+from dualslam.frontends.direct.warp import MIN_CONTRAST
 from dualslam.frontends.gap.auxiliary_map import Auxiliary
 from dualslam.frontends.gap.pose_finder import SEED_KEYFRAMES, Crossing, PoseFinder
 from dualslam.frontends.tracking.tracker import GivenPose
@@ -222,8 +223,6 @@ class PnpOdometry:
             finder.note(view, reference_id, T_cam_submap)
 
 
-MIN_CONTRAST = 4.0
-"""Standard deviation of the greys: sensors have a noise of 1 to 3, and blank images have that alone."""
 N_PREFETCHED = 1
 """Usable frames beyond the one at hand: a gap relocalisation takes two."""
 

@@ -282,7 +282,7 @@ class PoseFinder:
             return None
         place = se3.inverse(self._map.T_cam_submap(last))[:3, 3]
         step = float(np.linalg.norm(se3.inverse(track.T_cam_submap)[:3, 3] - place))
-        ids = track.landmark_ids[track.landmark_ids >= 0]
+        ids = track.seen_ids
         _, depth = project_points(self._submap.K, track.T_cam_submap, self._submap.landmarks["xyz_mu"][ids])
         if not step < SMALL_STEP * float(np.median(depth)):
             return None

@@ -24,6 +24,7 @@ from dualslam.core.columns import concatenate
 from dualslam.core.geometry import se3
 from dualslam.core.geometry.projection import projection_jacobians, refine_pose
 from dualslam.core.interfaces import Frontend
+from dualslam.core.noise_model import GATE_SIGMAS, MAJORITY
 from dualslam.core.types import BoolArray, Failure, Features, FloatArray, IntArray, Track, View
 from dualslam.frontends.direct.search import HALF_PX, match_patches
 from dualslam.frontends.direct.warp import Pyramid, build_pyramid, warp_points
@@ -40,8 +41,6 @@ FAR_KEYFRAMES = 8
 """Keyframes beyond a gap in which they are: the wider these stand, the better they know the landmarks' depths."""
 SEARCH_RAD = 0.022
 """About the predicted place, in the coarser image, as an angle: a pose from few matches is off by as much."""
-SEARCH_SIGMAS = 3.0
-"""Standard deviations of the predicted place that the search must reach."""
 ROUNDS = 4
 """Searches in one frame beyond a gap at most, each from the pose that the one before has left."""
 MAX_DEPTH_SIGMA = 0.1
@@ -53,8 +52,6 @@ MAX_ZOOM = 4.0
 SIGMA_PX = 0.45
 """Noise of a place, in pixels of the coarser image. On a rendered street, at half the distance or twice, half of the
 finds are within 0.25 to 0.5 px of the truth."""
-MAJORITY = 0.5
-"""Of the patches that are found must agree with one pose: below, it is chance that has found them."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -206,7 +203,7 @@ class Refinder:
         place += J_point @ covariance[known] @ J_point.swapaxes(1, 2)
         coarser = np.maximum(depth_kf[known] / depth[known], 1.0)
         sigma_rad = np.sqrt(np.linalg.eigvalsh(place)[:, -1]) / coarser / submap.K[0, 0]
-        known[known] = SEARCH_SIGMAS * sigma_rad < SEARCH_RAD
+        known[known] = GATE_SIGMAS * sigma_rad < SEARCH_RAD
         return np.asarray(known, np.bool_)
 
     def _find(self, sought: _Sought, track: Track, levels: Pyramid) -> _Found:

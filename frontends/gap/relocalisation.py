@@ -24,10 +24,11 @@ from dualslam.core.errors import SolverError
 from dualslam.core.geometry import se3
 from dualslam.core.geometry.projection import projection_jacobians
 from dualslam.core.geometry.triangulation import triangulate_n_view, triangulate_two_view
+from dualslam.core.noise_model import MIN_CONSENSUS
 from dualslam.core.types import BoolArray, Failure, FailureReason, FloatArray
 from dualslam.frontends.gap.auxiliary_map import TrackViews, triangulate
 from dualslam.frontends.gap.uncertainty import gap_uncertainty
-from dualslam.frontends.tracking.resection import MIN_CONSENSUS, resect
+from dualslam.frontends.tracking.resection import resect
 from dualslam.frontends.tracking.two_view_hypotheses import estimate_relative_pose
 
 

@@ -23,9 +23,10 @@ from dualslam.core.chi_square import CHI2_99, MEDIAN_CHI2
 from dualslam.core.firsts import rank_in_runs
 from dualslam.core.geometry.projection import project_points, refine_pose
 from dualslam.core.interfaces import Frontend
+from dualslam.core.noise_model import MIN_CONSENSUS
 from dualslam.core.types import BoolArray, Failure, FailureReason, Features, FloatArray, IntArray, Matches, Track
 from dualslam.frontends.features.groups import all_distances, best_per_group, lowest_in_group
-from dualslam.frontends.tracking.resection import MIN_CONSENSUS, resect
+from dualslam.frontends.tracking.resection import resect
 from dualslam.map.submap import Submap
 
 DOUBTFUL = 0.15

@@ -11,14 +11,13 @@ import numpy as np
 
 from dualslam.core.geometry import se3
 from dualslam.core.geometry.projection import projection_jacobians
+from dualslam.core.noise_model import MIN_LANDMARKS
 from dualslam.core.types import Failure, FailureReason, FloatArray, IntArray, Track
 from dualslam.map.landmark_views import landmark_covariances
 from dualslam.map.submap import Submap
 
 HESSIAN_INFLATION = 1.5
 """Of standard deviations: the poses that fix the points have errors too, and pixels of neighbours err alike."""
-MIN_POINTS = 4
-"""Landmarks that tell anything of a pose: three fix one."""
 SMALL_STEP = 0.1
 """Of the median depth: a scale that is off by a quarter then moves what lies beyond by 2.5 %."""
 
@@ -67,7 +66,7 @@ def pose_uncertainty(
     """
     covariances = landmark_covariances(submap, landmark_ids)
     known = np.isfinite(covariances).all(axis=(1, 2)) & (submap.depths(landmark_ids, T_cam_submap) > 0)
-    if np.count_nonzero(known) < MIN_POINTS:
+    if np.count_nonzero(known) < MIN_LANDMARKS:
         return None
     xyz = submap.landmarks["xyz_mu"][landmark_ids[known]]
     information = np.asarray(np.linalg.inv(covariances[known]), np.float64)
@@ -86,7 +85,7 @@ def refuse_lost_scale(submap: Submap, track: Track, last: Track, max_scale_sigma
 
     A step from the last track that is small against the depth of what is seen leaves the scale where it is.
     """
-    ids = track.landmark_ids[track.landmark_ids >= 0]
+    ids = track.seen_ids
     step = se3.inverse(track.T_cam_submap)[:3, 3] - se3.inverse(last.T_cam_submap)[:3, 3]
     if np.linalg.norm(step) < SMALL_STEP * np.median(submap.depths(ids, track.T_cam_submap)):
         return None

@@ -27,6 +27,7 @@ from dualslam.core.geometry import se3
 from dualslam.core.geometry.distortion import division_area_ratio, undistort_division
 from dualslam.core.geometry.two_view import fundamental_from_pose, sampson_error
 from dualslam.core.interfaces import Frontend
+from dualslam.core.noise_model import INFLATION
 from dualslam.core.types import Failure, FailureReason, Features, FloatArray
 from dualslam.frontends.tracking.resection import poselib_camera
 
@@ -53,7 +54,7 @@ LOG_FOCAL_PRIOR, LENS_PRIOR = (np.log(0.75), 0.3), (0.0, 0.1)
 cameras 0.45 to 0.6."""
 TOLD_RIGHT = 0.9
 """How likely a source's own data tell of these images: one may have been cropped since."""
-DEGREES_OF_FREEDOM, INFLATION = 3.0, 4.0
+DEGREES_OF_FREEDOM = 3.0
 """Of the Student distribution of a pair's cost, as some pairs are entirely wrong. The inflation scales errors above
 their residuals, as neighbouring points err alike (`INFLATION` of self-calibration)."""
 MODEL_SIGMA = 0.03

@@ -23,6 +23,8 @@ from dualslam.core.geometry import se3
 from dualslam.core.geometry.projection import refine_pose
 from dualslam.core.geometry.triangulation import triangulate_two_view
 from dualslam.core.interfaces import START_REACH, Frontend
+from dualslam.core.noise_model import GATE_SIGMAS, MIN_CONSENSUS, PROOF_VIEWS
+from dualslam.core.support import MAX_CHI2
 from dualslam.core.types import (
     BoolArray,
     Failure,
@@ -36,8 +38,8 @@ from dualslam.core.types import (
 )
 from dualslam.frontends.features.motion_statistics import match_by_motion, nearest_search
 from dualslam.frontends.tracking.direction import direction_angle_deg, direction_sigma_deg
-from dualslam.frontends.tracking.near_points import N_PROOF, nearer_than_proven, stands_before
-from dualslam.frontends.tracking.resection import MIN_CONSENSUS, resect
+from dualslam.frontends.tracking.near_points import nearer_than_proven, stands_before
+from dualslam.frontends.tracking.resection import MIN_SAMPLE, resect
 from dualslam.frontends.tracking.two_view_hypotheses import MIN_NOISE2, RelativePoses
 
 MIN_POINTS = 50
@@ -47,15 +49,11 @@ MIN_MATCHES = round(1.2 * MIN_POINTS)
 MIN_PARALLAX_DEG = 1.0
 """Angle under which the two cameras must see half as many points as `MIN_POINTS`, after the rotation is taken out.
 However many more are far away: on a road most are, and the near ones fix the motion."""
-MAX_CHI2 = 2.5
-"""Mean squared whitened residual per degree of freedom after the bundle adjustment (1 is expected)."""
 MAX_DIRECTION_SIGMA_DEG = 1.5
 """Largest standard deviation (from the bundle adjustment's Hessian) of the direction of translation: by the pixels'
 sigmas, or less in proportion, down to two thirds, where residuals are smaller than 0.3 of these."""
 MIN_SUPPORT = 0.6
 """Share of the points that the frames between the two views must confirm by their own pixels."""
-MAX_VIEWS = 120
-"""How many recent frames are kept as possible first views."""
 PATIENCE_S, MAX_LENIENCE = 10.0, 4 / 3
 """Seconds without a start after which its direction may be known less well, and how many times less at most: no map
 costs more then. For a camera that hardly leaves its place for 24 s (`tum_fr1_rpy`) the best pairs know it to 1.3 to 1.9
@@ -63,7 +61,6 @@ degrees. Some runs found none below 1.5, and ended without a map."""
 
 LAGS = (2, 4, 8, 16, 32, START_REACH)  # frames back that are tried as the first view
 MAX_PAIRS = 2  # tried with each view, in turn: what two views farther apart lack, the next two lack most often as well
-N_POSING = 3  # points that fix a pose
 N_WITNESSES = 3  # frames between the two views that must agree
 PROVEN = 1 / 3  # share of the points that are proven, at least: a start is made of these alone
 NEAR = 0.5  # share of the points that a start needs at least which must be near: on a road these fix the motion
@@ -72,7 +69,6 @@ UNEXPLAINED_TIMES, UNEXPLAINED_MORE = 2, 20  # and so is one that leaves more th
 SAME_DEG = 10.0  # directions of translation that far apart are two answers
 DIRECTION_MARGIN = 2.0  # a bundle adjustment makes a direction's sigma 0.5 to 1.7 times what it was (70 pairs)
 USUAL_NOISE2 = 0.09  # variance of the residuals of starts that turn (`tum_fr1_rpy`: 0.05 to 0.12), of their sigmas'
-AT_INFINITY_SIGMAS = 3.0  # a match whose parallax is less than so much noise says nothing of the sign of its depth
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -124,7 +120,7 @@ class Initialiser:
 
     def collect(self, view: View) -> None:
         """Keep a view as a possible first view, without trying to start from it."""
-        self._views = [*self._views[-MAX_VIEWS:], view]
+        self._views = [*self._views[-START_REACH:], view]
 
     def add(self, view: View, waited_s: float = 0.0, briefly: bool = False) -> Start | Failure:
         """Take a view in and try to start from it and an earlier one: with the next two in turn, `briefly` with one.
@@ -258,7 +254,7 @@ class Initialiser:
         )
         good = fits & (points.depth_a > 0) & (points.depth_b > 0)
         moved_px = np.linalg.norm(_turned(uv_a, self._K, T_b_a) - uv_b, axis=1)
-        n_explained = int((good | (fits & (moved_px < AT_INFINITY_SIGMAS * sigma_b))).sum())
+        n_explained = int((good | (fits & (moved_px < GATE_SIGMAS * sigma_b))).sum())
         angle = np.degrees(np.arccos(np.clip(points.cos_parallax[good], -1, 1)))
         # Points without parallax are no points of the map: their depth is anything.
         good[good] = angle > 0.5 * MIN_PARALLAX_DEG
@@ -315,7 +311,7 @@ class Initialiser:
         point, seen = matches.index[:, 0], matches.index[:, 1]
         uv_px, sigma_px = witness.features.uv_rect_px[seen], witness.features.sigma_px[seen]
         leads = ~stands_before(xyz[point, 2], xyz[:, 2])
-        if np.count_nonzero(~leads) < N_POSING:
+        if np.count_nonzero(~leads) < MIN_SAMPLE:
             leads[:] = True
         sigma = float(np.median(sigma_px))
         start = resect(self._K, self._size_px, uv_px[leads], xyz[point[leads]], sigma, self._seed)
@@ -360,7 +356,7 @@ class Initialiser:
         # of three views, by a gate in the residuals' own variance.
         inlier &= result.chi2 < CHI2_99[2] * float(np.clip(chi2, MIN_NOISE2, 1.0))
         n_views = np.bincount(problem.point[inlier], minlength=len(xyz))
-        proven = keep & _agreeing(problem, inlier) & (n_views >= N_PROOF)
+        proven = keep & _agreeing(problem, inlier) & (n_views >= PROOF_VIEWS)
         # Of a pattern that repeats itself, a third view of five fits by chance. Right before the camera a point weighs
         # most. There all views must have seen it, unless others that all have seen are as near.
         proven &= ~nearer_than_proven(result.xyz_mu[:, 2], proven & (n_views == len(views)))

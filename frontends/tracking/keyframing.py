@@ -12,7 +12,9 @@ import numpy as np
 from dualslam.core.config.settings import KeyframeConfig
 from dualslam.core.decisions import Gate, Ruling
 from dualslam.core.geometry import se3
+from dualslam.core.geometry.projection import MIN_DEPTH
 from dualslam.core.interfaces import Frontend
+from dualslam.core.noise_model import PROOF_VIEWS
 from dualslam.core.quantiles import median
 from dualslam.core.types import BoolArray, Features, FloatArray, IntArray, Track
 from dualslam.frontends.tracking.turning import unit_rays
@@ -32,11 +34,9 @@ half `euroc_takeoff` breaks: its bench has left before a keyframe comes."""
 N_LIKE = 5
 """Keyframes of earlier runs, those that see most of what a frame sees, that are asked whether one shows the same."""
 
-ESTABLISHED = 3  # views of a landmark from which on its loss says that the scene has changed
 LEAST_HOLD = 0.5
 """Share of the hold that must be left, of the share of the number: on roads near landmarks leave all the time, and with
 more than half keyframes come a tenth more often there."""
-NEAREST = 1e-6  # of a submap's unit, its first median depth
 
 
 def keyframe_due(track: Track, submap: Submap, reference_id: int, config: KeyframeConfig, first_id: int = 0) -> Ruling:
@@ -72,7 +72,7 @@ def keyframe_like(track: Track, submap: Submap, first_id: int, config: KeyframeC
     if track.n_inliers < config.weak_landmarks:
         return None
     in_view = np.union1d(track.visible_ids, track.landmark_ids)
-    covisible, _ = submap.covisible(track.landmark_ids[track.landmark_ids >= 0])
+    covisible, _ = submap.covisible(track.seen_ids)
     for k in covisible[covisible < first_id][:N_LIKE].tolist():
         gates = _shows_other(_share_in(in_view, submap, k), parallax_deg(track, submap, k), 0, config)
         if not any(gate.passed for gate in gates):
@@ -96,9 +96,8 @@ def _shows_other(share: float, parallax: float, n_frames: int, config: KeyframeC
 
 def _share_in(landmark_ids: IntArray, submap: Submap, keyframe_id: int, by_hold: bool = False) -> float:
     """Return the share of a keyframe's established landmarks that are among some; `by_hold`: of their hold on it."""
-    reference = submap.landmark_of[keyframe_id]
-    reference = reference[reference >= 0]
-    established = submap.n_observations(reference) >= min(ESTABLISHED, len(submap.keyframes))
+    reference = submap.seen_in(keyframe_id)
+    established = submap.n_observations(reference) >= min(PROOF_VIEWS, len(submap.keyframes))
     reference = reference[established]
     if not len(reference):
         return 0.0
@@ -111,18 +110,18 @@ def _share_in(landmark_ids: IntArray, submap: Submap, keyframe_id: int, by_hold:
 
 def _hold(landmark_ids: IntArray, submap: Submap, T_cam_submap: FloatArray) -> FloatArray:
     """Return by how much each landmark holds a camera: what a pixel tells of its position falls as depth squared."""
-    return np.maximum(submap.depths(landmark_ids, T_cam_submap), NEAREST) ** -2.0
+    return np.maximum(submap.depths(landmark_ids, T_cam_submap), MIN_DEPTH) ** -2.0
 
 
 def _n_holding(track: Track, submap: Submap) -> float:
     """Return how many landmarks, all as near as each other, would hold the position as evenly as those tracked do."""
-    hold = _hold(track.landmark_ids[track.landmark_ids >= 0], submap, track.T_cam_submap)
+    hold = _hold(track.seen_ids, submap, track.T_cam_submap)
     return float(hold.sum() ** 2 / (hold @ hold)) if len(hold) else 0.0
 
 
 def parallax_deg(track: Track, submap: Submap, reference_id: int) -> float:
     """Angle under which the baseline to a keyframe is seen from the scene's median depth, degrees; 0 of no scene."""
-    ids = track.landmark_ids[track.landmark_ids >= 0]
+    ids = track.seen_ids
     if not len(ids):
         return 0.0
     T_cam_submap = track.T_cam_submap

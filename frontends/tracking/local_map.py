@@ -9,13 +9,14 @@ from numpy.typing import NDArray
 
 from dualslam.core.camera.base import Camera
 from dualslam.core.geometry.projection import project_points
+from dualslam.core.noise_model import MAJORITY, PROOF_VIEWS
 from dualslam.core.types import BoolArray, FloatArray, IntArray
-from dualslam.frontends.tracking.near_points import N_PROOF, nearer_than_proven
+from dualslam.frontends.tracking.near_points import nearer_than_proven
 from dualslam.map.submap import Submap
 
 VIEW_COSINE_MIN = 0.5  # a patch seen from more than 60 degrees off its mean direction does not look the same
-SAFE, MOST = 2, 0.5
-"""With fewer proven landmarks than so many times the inliers that are asked for, or than this share, all are used."""
+SAFE = 2
+"""With fewer proven landmarks than so many times the inliers that are asked for, or than the majority, all are used."""
 
 
 def covering_keyframes(submap: Submap, at_most: int, min_new: int) -> list[int]:
@@ -24,7 +25,7 @@ def covering_keyframes(submap: Submap, at_most: int, min_new: int) -> list[int]:
     Each shows the most landmarks that those before it do not (ties: lower id), and `min_new` of them at least.
     """
     seen = np.zeros(len(submap.landmarks), bool)
-    left = {k: submap.landmark_of[k][submap.landmark_of[k] >= 0] for k in sorted(submap.keyframes)}
+    left = {k: submap.seen_in(k) for k in sorted(submap.keyframes)}
     chosen: list[int] = []
     while left and len(chosen) < at_most:
         n_new = {k: np.count_nonzero(~seen[ids]) for k, ids in left.items()}
@@ -112,7 +113,7 @@ class LocalMap:
 
 def trusted(submap: Submap, ids: IntArray, T_cam_submap: FloatArray, min_inliers: int) -> BoolArray:
     """Return which landmarks a pose is estimated from: not unproven ones right before the camera."""
-    proven = np.asarray(submap.n_observations(ids) >= N_PROOF)
-    if np.count_nonzero(proven) < max(SAFE * min_inliers, MOST * len(ids)):
+    proven = np.asarray(submap.n_observations(ids) >= PROOF_VIEWS)
+    if np.count_nonzero(proven) < max(SAFE * min_inliers, MAJORITY * len(ids)):
         return np.ones(len(ids), np.bool_)
     return ~nearer_than_proven(submap.depths(ids, T_cam_submap), proven)

@@ -20,6 +20,7 @@ from dualslam.core.estimates import ReadoutEstimate
 from dualslam.core.firsts import rank_in_runs
 from dualslam.core.geometry import se3
 from dualslam.core.geometry.projection import project_points, projection_jacobians
+from dualslam.core.noise_model import MIN_DEPTH_MU, PROOF_VIEWS
 from dualslam.core.robust import huber_weights
 from dualslam.core.types import BoolArray, Failure, FailureReason, FloatArray, IntArray
 from dualslam.map.submap import Submap
@@ -29,8 +30,6 @@ MAX_KEYFRAMES = 40
 MIN_KEYFRAMES = 8
 PER_KEYFRAME = 150
 """Observations of each, of the landmarks with the longest tracks: they tell, and bound the time (0.1 s)."""
-MIN_VIEWS = 3
-"""Keyframes of the window that must see a landmark: two views take their errors for depth."""
 MIN_OBSERVATIONS = 500
 ROBUST_K = 0.8
 """Huber's threshold, in sigmas: about twice what residuals are."""
@@ -39,7 +38,6 @@ STEPS = 4
 left (1.4, 1.7, 1.9 of 1.95 ms)."""
 DAMPING = 1e-4
 """Relative to the diagonal: what keeps depths without parallax, and the map's scale, where they are."""
-MIN_DEPTH = 1e-3
 
 
 @dataclass(slots=True, eq=False)
@@ -66,7 +64,7 @@ class ReadoutQuestion:
             rows = np.flatnonzero(self.kf == f)
             found[rows], depth[rows] = project_points(self.K, T, self.xyz[self.point[rows]])
         found += self.readout_s * self.by_readout
-        front = depth > MIN_DEPTH
+        front = depth > MIN_DEPTH_MU
         return np.where(front[:, None], (found - self.uv_px) / self.sigma_px[:, None], 0.0), front
 
 
@@ -116,7 +114,7 @@ def _collect(submap: Submap, ids: IntArray, rates_rad_s: FloatArray, height_px: 
     kf, landmark = np.searchsorted(ids, obs["kf"][rows]), obs["landmark"][rows]
     T = se3.inverse(submap.keyframe_poses(ids))
     depth = np.einsum("rj,rj->r", T[kf, 2, :3], submap.landmarks["xyz_mu"][landmark]) + T[kf, 2, 3]
-    rows, kf, landmark = rows[depth > MIN_DEPTH], kf[depth > MIN_DEPTH], landmark[depth > MIN_DEPTH]
+    rows, kf, landmark = rows[depth > MIN_DEPTH_MU], kf[depth > MIN_DEPTH_MU], landmark[depth > MIN_DEPTH_MU]
     # The longest tracks of each keyframe; then what has views enough among all of them.
     n_views = np.bincount(landmark, minlength=len(submap.landmarks))
     order = np.lexsort((landmark, -n_views[landmark], kf))
@@ -124,7 +122,7 @@ def _collect(submap: Submap, ids: IntArray, rates_rad_s: FloatArray, height_px: 
     rank[order] = rank_in_runs(kf[order])
     wanted = np.zeros(len(submap.landmarks), np.bool_)
     wanted[landmark[rank < PER_KEYFRAME]] = True
-    kept = wanted[landmark] & (n_views[landmark] >= MIN_VIEWS)
+    kept = wanted[landmark] & (n_views[landmark] >= PROOF_VIEWS)
     rows, kf, landmark = rows[kept], kf[kept], landmark[kept]
     points, point = np.unique(landmark, return_inverse=True)
     uv, sigma = submap.observed_pixels(rows)

@@ -14,6 +14,7 @@ from dualslam.core.geometry import se3
 from dualslam.core.geometry.triangulation import triangulate_two_view
 from dualslam.core.geometry.two_view import fundamental_from_pose
 from dualslam.core.interfaces import Frontend
+from dualslam.core.noise_model import CELLS_ACROSS, COVISIBLE, PROOF_VIEWS, SAME_POINT_PX
 from dualslam.core.quantiles import median
 from dualslam.core.types import BoolArray, Features, FloatArray, IntArray, Keyframe, Track
 from dualslam.frontends.features.matching import FeatureGrid, match_epipolar, match_projected
@@ -22,8 +23,6 @@ from dualslam.map.submap import NO_LANDMARK, Submap
 
 MIN_FOUND_RATIO = 0.25
 """A young landmark that tracking finds in fewer of the frames that should see it is culled."""
-MIN_OBSERVATIONS = 3
-"""Keyframes that must see a landmark by the time that two more keyframes have come."""
 MIN_PARALLAX_DEG = 1.0
 """Smallest angle between the two rays of a new landmark, unless it is a far one."""
 MAX_OBSERVATIONS = 250
@@ -36,11 +35,7 @@ FEW = 0.5
 FAR_SIGMAS = 2.0
 """Parallax of a far point, in standard deviations of its two pixels: its depth is known to half."""
 
-FUSE_RADIUS_PX = 3.0  # about 3 sigma of a well-posed landmark's pixel at the finest octave
-CELLS_ACROSS = 16  # cells of the image's width by which observations are spread
-YOUNG_KEYFRAMES = 3  # a landmark is on probation for this many keyframes
 N_GRIDS = 24  # keyframes whose grid of features is kept
-N_OTHERS = 3  # views by others that make an observation redundant
 
 
 def spread_choice(uv_px: FloatArray, priority: IntArray, n: int, size_px: tuple[int, int]) -> BoolArray:
@@ -114,9 +109,8 @@ class Mapper:
     def _neighbours(self, keyframe_id: int) -> list[int]:
         """Older keyframes to pair with: the most covisible, with baselines as different as they come."""
         submap = self._submap
-        ids = submap.landmark_of[keyframe_id]
-        found, counts = submap.covisible(ids[ids >= 0])
-        keep = (found != keyframe_id) & (counts >= 15)
+        found, counts = submap.covisible(submap.seen_in(keyframe_id))
+        keep = (found != keyframe_id) & (counts >= COVISIBLE)
         covisible = [int(k) for k in found[keep][:TRIANGULATE_AGAINST]]
         if covisible:
             return covisible
@@ -141,9 +135,9 @@ class Mapper:
             ratio = lm["n_found"][ids] / np.maximum(lm["n_visible"][ids], 1)
             bad = ratio < MIN_FOUND_RATIO
             if age >= 2:
-                bad |= submap.n_observations(ids) < MIN_OBSERVATIONS
+                bad |= submap.n_observations(ids) < PROOF_VIEWS
             submap.remove_landmarks(ids[bad])
-            if age < YOUNG_KEYFRAMES:
+            if age < PROOF_VIEWS:
                 kept.append((born, ids[~bad]))
         self._young = kept
 
@@ -166,7 +160,7 @@ class Mapper:
             self._grid(k, features),
             features,
             prediction.uv_px,
-            FUSE_RADIUS_PX * frontend.scale_factor**prediction.octave,
+            SAME_POINT_PX * frontend.scale_factor**prediction.octave,
             local.descriptors[prediction.rows],
             octave=prediction.octave,
             max_distance=frontend.max_distance_strict,
@@ -257,13 +251,8 @@ class Mapper:
 
     def _median_depth(self, k: int) -> float:
         """Median depth of a keyframe's landmarks; infinite if it has none."""
-        submap = self._submap
-        ids = submap.landmark_of[k]
-        ids = ids[ids >= 0]
-        if len(ids) == 0:
-            return np.inf
-        T_cam_submap = se3.inverse(submap.T_submap_kf[k])
-        return median(submap.depths(ids, T_cam_submap))
+        depths = self._submap.depths_in(k)
+        return median(depths) if len(depths) else np.inf
 
     def _scales_agree(
         self, a: Features, b: Features, fa: IntArray, fb: IntArray, depth_a: FloatArray, depth_b: FloatArray
@@ -300,9 +289,8 @@ class Mapper:
         """Return the first candidate whose landmarks are nearly all seen by three others at the same or finer scale."""
         n_seen = self._submap.n_observations(np.arange(len(self._submap.landmarks)))
         for k in candidates:
-            ids = self._submap.landmark_of[k]
             # Seen by too few others at whatever scale: no need to look at scales.
-            enough = n_seen[ids[ids >= 0]] > N_OTHERS
+            enough = n_seen[self._submap.seen_in(k)] > PROOF_VIEWS
             if (len(enough) == 0 or self._are_nearly_all(enough)) and self._is_redundant(k):
                 return k
         return None
@@ -330,7 +318,7 @@ class Mapper:
         landmark = obs["landmark"][rows]
         octave = np.concatenate(octaves) if octaves else landmark
         as_fine = np.bincount(landmark[octave <= own[landmark] + 1], minlength=len(submap.landmarks))
-        return self._are_nearly_all(as_fine[ids] >= N_OTHERS)
+        return self._are_nearly_all(as_fine[ids] >= PROOF_VIEWS)
 
 
 def _wide_enough(depth_mu: float, baseline_mu: float, min_parallax_deg: float) -> bool:

@@ -7,8 +7,6 @@ import numpy as np
 from dualslam.core.quantiles import quantile
 from dualslam.core.types import BoolArray, FloatArray
 
-N_PROOF = 3
-"""Views that prove a point: two show it on the epipolar line of each other, where anything may be."""
 NEARER, NEAREST = 0.5, 0.05
 """Too near is what is nearer than so many times the depth of the nearest proven points (this share of them): the lever
 is twice as long."""

@@ -9,13 +9,13 @@ from dualslam.core.camera.base import Camera
 from dualslam.core.chi_square import CHI2_95
 from dualslam.core.geometry.two_view import fundamental_from_pose, sampson_error
 from dualslam.core.interfaces import Frontend
+from dualslam.core.noise_model import GATE_SIGMAS, INFLATION
 from dualslam.core.types import Features, FloatArray, View
+from dualslam.frontends.tracking.focal_search import MIN_MATCHES
 from dualslam.frontends.tracking.resection import poselib_camera
 from dualslam.frontends.tracking.row_shifts import at_mid_row
 
-INFLATION = 4.0
-"""How much larger errors are taken to be than they seem, as neighbouring pixels err alike."""
-READOUT_EVIDENCE = (3.0 * INFLATION) ** 2
+READOUT_EVIDENCE = (GATE_SIGMAS * INFLATION) ** 2
 """Chi-square by which a rolling shutter must explain frames better than a global one, or a global one better than 0.02
 s, to be known: three sigmas of inflated errors."""
 
@@ -37,7 +37,6 @@ ENOUGH_PAIRS, ENOUGH_CURVATURE = 150, 50.0
 """Pairs after which the time that is known is good enough; or the second difference of chi-square at it, by steps: a
 sigma of 0.004 s with errors four times what they seem. On the first 200 frames of a hand-held turn the first estimates
 lay between 0.012 and 0.035 s, depending on the pairs. All pairs together give 0.026."""
-MIN_MATCHES = 60
 STEP_TOLERANCE = 1e-4
 """At which a refinement ends, radians: a twentieth of a pixel. Chi-squares, of hundreds, are 0.02 off at most."""
 

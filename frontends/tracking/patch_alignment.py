@@ -14,27 +14,23 @@ from numpy.typing import NDArray
 
 from dualslam.core.camera.base import Camera
 from dualslam.core.geometry import se3
+from dualslam.core.noise_model import MAJORITY
 from dualslam.core.types import REFINED_PX, BoolArray, FloatArray, IntArray
-from dualslam.frontends.direct.warp import Pyramid, build_pyramid, correlate, inside, sample
+from dualslam.frontends.direct.patches import MIN_CONTRAST
+from dualslam.frontends.direct.warp import HALF, Pyramid, build_pyramid, correlate, inside, sample, warp_points
 from dualslam.frontends.tracking.keyframe_images import KeyframeImages
 from dualslam.frontends.tracking.row_shifts import find_as_read
 from dualslam.map.submap import NO_LANDMARK, Submap
 
-HALF = 4
-"""Half the side of a patch, in pixels of the reference's octave: 9 x 9 of them."""
 N_ITERATIONS = 4
 MAX_ZOOM = 1.5
 """Change of size between two patches that are compared: beyond, one is sampled too coarsely for the other."""
-MIN_CONTRAST = 3.0
-"""Standard deviation of a patch's grey values: less is noise."""
 MAX_CONDITION = 100.0
 """Ratio of a patch's gradients across and along an edge (squared): above, the edge leaves one direction open."""
 CONVERGED = 0.1
 """Last step in pixels of the patch."""
 AGREES = 0.85
 """Correlation of two patches of the same surface."""
-MAJORITY = 0.5
-"""Share of an image's patches that must agree for the others to count as wrong. A blurred image has few."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -89,7 +85,7 @@ class PatchAlignment:
             return rows[:0]
         rows, ids, feature = rows[known], ids[known], feature[known]
         camera, keyframe = self._camera(), submap.keyframes[k]
-        aligned = self._align(submap, k, ids, feature, reference[known], feature_there[known])
+        aligned = self._align_in(submap, k, ids, feature, reference[known], feature_there[known])
         n_tested, moved = np.count_nonzero(aligned.tested), aligned.agrees
         features, at = keyframe.features, feature[moved]
         uv, uv_rect = features.uv_px.copy(), features.uv_rect_px.copy()
@@ -122,7 +118,7 @@ class PatchAlignment:
             reference[takes], feature[takes] = other, feature_of[ids[takes]]
         return reference, feature
 
-    def _align(
+    def _align_in(
         self, submap: Submap, k: int, ids: IntArray, feature: IntArray, reference: IntArray, feature_there: IntArray
     ) -> _Aligned:
         camera, n = self._camera(), len(ids)
@@ -138,7 +134,7 @@ class PatchAlignment:
             T_k_there[of] = T_k_submap @ T_submap_other
             templates[of] = self._templates(other, feature_there[of], uv_there[of], scale[of])
         steps = scale[:, None, None] * np.eye(2)
-        axes = steps @ _jacobians(camera, uv_there, depth, T_k_there)
+        axes = steps @ warp_points(camera, uv_there, depth, T_k_there).J_b_a
         uv = self._as_read(submap, k, feature, camera)
         usable = inside(uv_there, steps, HALF + 1, camera.size_px) & np.isfinite(axes).all(axis=(1, 2))
         usable[usable] = inside(uv[usable], axes[usable], HALF, camera.size_px)
@@ -167,18 +163,6 @@ class PatchAlignment:
         if k not in self._pyramids:
             self._pyramids[k] = build_pyramid(self._images[k].image.pixels())
         return self._pyramids[k]
-
-
-def _jacobians(camera: Camera, uv_px: FloatArray, depth: FloatArray, T_b_a: FloatArray) -> FloatArray:
-    """Return derivatives (N, 2, 2) of pixels in views b by those in views a (N, 2), on planes parallel to a's image.
-
-    NaN where view b does not show a point.
-    """
-    rays = camera.unproject((uv_px + np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])[:, None]).reshape(-1, 2))
-    p = (rays * (np.tile(depth, 3) / rays[:, 2])[:, None]).reshape(3, -1, 3)
-    p_b = np.einsum("nij,snj->sni", T_b_a[:, :3, :3], p) + T_b_a[:, :3, 3]
-    here, right, down = camera.project(p_b.reshape(-1, 3)).reshape(3, -1, 2)
-    return np.asarray(np.stack([right - here, down - here], axis=2))
 
 
 def _align(

@@ -107,7 +107,7 @@ class PixelSearch:
     def _references(self, submap: Submap, last: Track, camera: Camera) -> tuple[tuple[PosedImage, ...], _Described]:
         """Return the last frame and the keyframes that show the same, with how each of their landmarks is described."""
         references, described = [], _Described()
-        seen = last.landmark_ids[last.landmark_ids >= 0]
+        seen = last.seen_ids
         near = [int(k) for k in submap.covisible(seen)[0] if int(k) in self._images and int(k) != last.view.index]
         views = [(last.view, last.T_cam_submap, last.landmark_ids)]
         for k in sorted(near[:N_KEYFRAMES], reverse=True):

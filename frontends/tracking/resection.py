@@ -10,10 +10,6 @@ import poselib
 from dualslam.core.geometry.projection import PoseEstimate, refine_pose
 from dualslam.core.types import BoolArray, Failure, FloatArray
 
-MIN_CONSENSUS = 12
-"""Matches below which a RANSAC consensus of a 3-point solver is no evidence."""
-
-
 MIN_SAMPLE = 3
 """Points that fix a pose."""
 

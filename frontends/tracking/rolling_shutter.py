@@ -14,6 +14,7 @@ import numpy as np
 from dualslam.core.camera.base import Camera
 from dualslam.core.config.settings import CameraConfig
 from dualslam.core.interfaces import Frontend
+from dualslam.core.noise_model import MISSING_INTERVALS
 from dualslam.core.types import Failure, Features, FloatArray, View
 from dualslam.frontends.tracking.map_readout import ReadoutQuestion, ask_readout
 from dualslam.frontends.tracking.pair_readout import READOUT_EVIDENCE, ReadoutEstimator, is_fast
@@ -27,9 +28,6 @@ TURN_FEATURES = 400
 """Features of a frame that tell its turn: 100 matches of two pixels each fix it to 0.2 px."""
 KEPT_RATES = 3600
 """Frames whose turn is kept while the readout time may still change: two minutes at 30 Hz."""
-MAX_GAP = 2.5
-"""Of two times between frames, how much longer the later one may be for the turn to be carried on from one to the
-other."""
 
 
 def _largest(features: Features) -> Features:
@@ -72,7 +70,7 @@ class TurnMeter:
         if turn is None or self._gap_s == 0 or goes_back:
             return np.zeros(3) if before is None else before
         self.between_rad_s = rate = turn / self._gap_s
-        if before is None or abs(self._gap_s) > MAX_GAP * abs(gap_s):
+        if before is None or abs(self._gap_s) > MISSING_INTERVALS * abs(gap_s):
             return rate
         return np.asarray(rate + self._gap_s / (gap_s + self._gap_s) * (rate - before), np.float64)
 

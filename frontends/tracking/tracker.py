@@ -16,6 +16,7 @@ from dualslam.core.config.settings import TrackingConfig
 from dualslam.core.geometry import se3, sim3
 from dualslam.core.geometry.projection import PoseEstimate, project_points, refine_pose
 from dualslam.core.interfaces import Frontend
+from dualslam.core.noise_model import MIN_CONSENSUS
 from dualslam.core.types import Failure, FailureReason, FloatArray, IntArray, Track, View
 from dualslam.frontends.features.matching import FeatureGrid, match_projected
 from dualslam.frontends.gap.second_pose import refuse_second_pose
@@ -23,7 +24,7 @@ from dualslam.frontends.gap.uncertainty import refuse_lost_scale
 from dualslam.frontends.tracking.local_map import LocalMap, Prediction, covering_keyframes, trusted
 from dualslam.frontends.tracking.motion import Motion
 from dualslam.frontends.tracking.pixel_search import PixelSearch
-from dualslam.frontends.tracking.resection import MIN_CONSENSUS, estimate_pose
+from dualslam.frontends.tracking.resection import estimate_pose
 from dualslam.map.submap import NO_LANDMARK, Submap
 
 SEARCH_RADIUS_PX = 15.0
@@ -45,7 +46,6 @@ deviation where it only guides the search in the local map, a thirtieth where it
 REDETECTED = 0.25
 """Share of the landmarks that pixels find from which on features pose a frame by themselves: a detector finds a third
 of its points again from another side, and most of these match."""
-BEFORE_GAP = 3  # keyframes whose landmarks are asked for a second pose beyond a gap
 GIVEN_POSE_CHI2 = 4 * CHI2_99[2]  # 99 % with 2 degrees of freedom, and the pose off by as much as a pixel
 
 
@@ -198,8 +198,7 @@ class Tracker:
         features = view.features
         if len(features) < self._config.min_inliers:
             return Failure(FailureReason.NO_TEXTURE, f"{len(features)} features in the image")
-        ids = self._submap.landmark_of[keyframe_id]
-        covisible, _ = self._submap.covisible(ids[ids >= 0])
+        covisible, _ = self._submap.covisible(self._submap.seen_in(keyframe_id))
         about = [keyframe_id, *(k for k in covisible.tolist() if k != keyframe_id)]
         found = self._pose_from_wide_matches(view, about[:WIDE_KEYFRAMES])
         if isinstance(found, Failure):
@@ -208,7 +207,7 @@ class Tracker:
         track = self._pose_from_local_map(local, view, grid, *found, found[0], wide=True)
         if isinstance(track, Failure):
             return track
-        refused = self._refuse_second_pose(track, about[:BEFORE_GAP])
+        refused = self._refuse_second_pose(track, about[:WIDE_KEYFRAMES])
         if refused is not None:
             return refused
         self.start(track)
@@ -343,7 +342,9 @@ class Tracker:
         is not crossed any more: frames further on show ever less of what was seen, and one would pass by chance.
         """
         if self._doubt is None:
-            self._doubt = self._refuse_second_pose(track, self._submap.keyframes_near(track.view.index)[:BEFORE_GAP])
+            self._doubt = self._refuse_second_pose(
+                track, self._submap.keyframes_near(track.view.index)[:WIDE_KEYFRAMES]
+            )
         return self._doubt
 
     def _refuse_second_pose(self, track: Track, keyframe_ids: Sequence[int]) -> Failure | None:

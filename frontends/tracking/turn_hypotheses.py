@@ -12,14 +12,15 @@ import numpy as np
 from dualslam.core.chi_square import CHI2_95
 from dualslam.core.geometry import so3
 from dualslam.core.types import BoolArray, FloatArray, IntArray
+from dualslam.frontends.tracking.turning import MIN_PIXELS
 
 N_SAMPLES = 200
 """Pairs of matches that a turn, and then a translation, is tried from: of a layer of a sixth, one at 99.6 %."""
 N_SCORED = 400
 """Matches, at random, that score them: a layer of a tenth is still 40."""
 N_LAYERS = 2
-MIN_FAR, MIN_FAR_SHARE = 20, 0.1
-"""Matches, and their share of all, that must move as one turn does to be a layer of far points and not chance."""
+MIN_FAR_SHARE = 0.1
+"""Share of all matches that must move as one turn does to be a layer of far points and not chance."""
 
 
 class TurnHypotheses:
@@ -53,7 +54,7 @@ class TurnHypotheses:
         Returns list of (4, 4): t_b_a with a baseline of 1; at most `N_LAYERS`, or none.
         """
         views, rng, R, far = self._views, self._rng, self._turn, self._far
-        enough = max(MIN_FAR, MIN_FAR_SHARE * len(self._all))
+        enough = max(MIN_PIXELS, MIN_FAR_SHARE * len(self._all))
         left, poses = self._all, []
         for layer in range(N_LAYERS):
             if len(left) < enough:
@@ -65,7 +66,7 @@ class TurnHypotheses:
             if far.sum() < enough:
                 break
             near = np.flatnonzero(~far)
-            t = views.direction_with(R, near, rng) if len(near) >= MIN_FAR else None
+            t = views.direction_with(R, near, rng) if len(near) >= MIN_PIXELS else None
             if t is not None:
                 T_b_a = np.eye(4)
                 T_b_a[:3, :3], T_b_a[:3, 3] = R, t

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 import poselib
 
-from dualslam.core.chi_square import CHI2_95
+from dualslam.core.chi_square import CHI2_95, MEDIAN_CHI2
 from dualslam.core.geometry.two_view import (
     decompose_homography,
     fundamental_from_pose,
@@ -24,8 +24,6 @@ PLANAR_SHARE = 0.6
 """Of what the essential matrix explains: a board gives 0.65 and more (40 pairs of rendered views), a street 0.3 to 0.4,
 a room 0.3 to 0.7."""
 
-CHI2_MEDIAN = 0.455
-"""Of one degree of freedom."""
 MIN_NOISE2 = 0.04
 """Of pixels a fifth as noisy as supposed: below, the pictures are drawn, and what is off is the lens."""
 
@@ -90,7 +88,7 @@ class RelativePoses:
         right = sampson2 < CHI2_95[1] * variance
         # Pixels are better than their sigmas suppose: how much better, the epipolar distances tell. A point transferred
         # has the noise of both images.
-        noise2 = float(np.median(sampson2[right] / variance[right])) / CHI2_MEDIAN if right.any() else 1.0
+        noise2 = float(np.median(sampson2[right] / variance[right])) / MEDIAN_CHI2[1] if right.any() else 1.0
         transfer2 = np.asarray(homography_transfer_error(H_b_a, uv_a, uv_b).mean(axis=1), np.float64)
         flat = transfer2 < CHI2_95[2] * 2.0 * variance * np.clip(noise2, MIN_NOISE2, 1.0)
         share = float((right & flat).sum() / max(int(right.sum()), 1))

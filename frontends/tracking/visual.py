@@ -187,7 +187,7 @@ class VisualFrontEnd:
         last = self._tracker.last
         if last is None:
             return
-        covisible, _ = self.submap.covisible(last.landmark_ids[last.landmark_ids >= 0])
+        covisible, _ = self.submap.covisible(last.seen_ids)
         if len(covisible):
             self._reference_id = int(covisible[0])
         self._tracker.refresh()
@@ -271,8 +271,7 @@ class VisualFrontEnd:
             self.submap.relative_poses[track.view.index] = known
         track = self._refound(track, pose_is_given)
         self._mapper.observe(track)
-        if not in_haste:
-            self._align(self._rows_of(track.view.index))
+        self._align(self._rows_of(track.view.index), in_haste)
         matched = self._rows_of(track.view.index)
         rebuild = self._rebuild_due(track)
         posed = self._pose(track, len(matched), pose_is_given)
@@ -283,9 +282,8 @@ class VisualFrontEnd:
             return Failure(FailureReason.CHI_SQUARE, detail, {"n_refused": float(n_refused)})
         n_before = len(self.submap.observations)
         self._mapper.grow(track, self._apart, posed.noise2)
-        if not in_haste:
-            grown_rows = np.arange(n_before, len(self.submap.observations))
-            self._align(grown_rows[self.submap.observations["alive"][grown_rows]])
+        grown_rows = np.arange(n_before, len(self.submap.observations))
+        self._align(grown_rows[self.submap.observations["alive"][grown_rows]], in_haste)
         grown = self._solve(rebuild)
         self._meet(track.view.index)
         self._cull_keyframe()
@@ -293,9 +291,9 @@ class VisualFrontEnd:
         failed = posed.rebuilt or (grown.rebuilt and not rebuild)
         return KeyframeReport(posed, grown, failed)
 
-    def _align(self, rows: IntArray) -> None:
-        """Align observations with older ones of their landmarks, where images are kept."""
-        if self._alignment is not None:
+    def _align(self, rows: IntArray, in_haste: bool) -> None:
+        """Align observations with older ones of their landmarks, where images are kept and there is time."""
+        if self._alignment is not None and not in_haste:
             self._alignment.refine(self.submap, rows)
 
     def _pose(self, track: Track, n_matched: int, pose_is_given: bool) -> GraphEstimate:
@@ -373,8 +371,7 @@ class VisualFrontEnd:
     def _cull_keyframe(self) -> None:
         """Cull at most one keyframe that has become redundant; those of the gauge stay."""
         submap = self.submap
-        ids = submap.landmark_of[self._reference_id]
-        covisible, _ = submap.covisible(ids[ids >= 0])
+        covisible, _ = submap.covisible(submap.seen_in(self._reference_id))
         kept = {*submap.gauge, *self._path[-CULL_BEHIND:], *self._kept}
         candidates = [k for k in covisible.tolist() if k not in kept][:N_CULL_CANDIDATES]
         culled = self._mapper.redundant_keyframe(candidates)

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from dualslam.core.config.settings import LinkingConfig
+from dualslam.core.noise_model import MAJORITY
 from dualslam.core.types import Failure, FailureReason
 from dualslam.linking import DescriptorMatcher, LinkEstimate, LinkRefusal, estimate, estimate_link
-from dualslam.linking.gates import MIN_MAJORITY
 from dualslam.testing import adversaries
 from dualslam.testing.link_worlds import Case, hamming, is_wrong, link_error
 
@@ -136,7 +136,7 @@ def test_reverse_tracking_over_a_corrupted_tail(layout, seed, ties):
     if isinstance(result, LinkEstimate):
         assert oldest >= 5  # soon after there are enough keyframes (from 6 on)
     else:  # keyframes on both sides of the tear agree
-        assert link.numbers["handed_on"] < MIN_MAJORITY
+        assert link.numbers["handed_on"] < MAJORITY
     assert not is_wrong(case, link.S_old_new)
     first_wrong = adversaries.ONSET_ID + (3 if seed % 4 == 2 else 0)  # a change of scale leaves its own camera right
     assert link.agreeing_keyframes.max() < first_wrong

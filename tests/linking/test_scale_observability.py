@@ -10,11 +10,12 @@ import pytest
 from dualslam.backend.submap_graph import ISam2SubmapGraph
 from dualslam.core.config.settings import GraphConfig, LinkingConfig
 from dualslam.core.geometry import se3
+from dualslam.core.noise_model import GATE_SIGMAS
 from dualslam.core.types import Failure, FailureReason, FloatArray, IntArray
 from dualslam.linking import DescriptorMatcher, LinkEstimate, estimate, estimate_link, propagate_to_live_end
 from dualslam.linking.correspondences import propose_correspondences
 from dualslam.linking.estimate import LinkRefusal
-from dualslam.linking.gates import GATE_SIGMAS, MIN_TIES, MINORITY_DEFORMATION, PIXEL_CHI2
+from dualslam.linking.gates import MIN_TIES, MINORITY_DEFORMATION, PIXEL_CHI2
 from dualslam.linking.join_test import LinkEvidence
 from dualslam.linking.pairs import PairModel
 from dualslam.linking.scale_observability import scale_sigma_between

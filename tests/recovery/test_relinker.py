@@ -7,9 +7,9 @@ from typing import Any, cast
 
 import numpy as np
 
+from dualslam.core.noise_model import GROUP
 from dualslam.core.types import Failure, FailureReason
 from dualslam.linking import LinkRefusal
-from dualslam.linking.gates import TIE_WINDOW
 from dualslam.map.submap import Submap
 from dualslam.recovery.relinker import Relinker
 
@@ -96,7 +96,7 @@ def test_a_map_that_is_torn_stays_so_once_all_is_there_that_is_asked_about_the_p
         list(relinker.attempts(k))
         enough.append(relinker.has_seen_enough)
     n_beyond = np.arange(1, 9) - 2  # of 198 and later are two
-    assert enough == (n_beyond >= TIE_WINDOW).tolist()
+    assert enough == (n_beyond >= GROUP).tolist()
 
 
 def test_lost_maps_of_too_few_keyframes_are_hopeless_once_all_are_held() -> None:

@@ -13,11 +13,11 @@ from dualslam.atlas.trajectory import FramePose
 from dualslam.core.config.settings import LinkingConfig
 from dualslam.core.events import EventKind
 from dualslam.core.geometry import se3
+from dualslam.core.noise_model import GROUP
 from dualslam.core.types import FrameStatus
 from dualslam.io.run_folder import FrameRow
 from dualslam.map.submap import Submap
 from dualslam.recovery.scale_parts import SPAN, part_what_lost_its_scale
-from dualslam.recovery.scale_watch import GROUP
 from dualslam.run.results import trajectories_of
 from dualslam.system.system import System
 from dualslam.testing.link_worlds import FRAME_STEP, thinned

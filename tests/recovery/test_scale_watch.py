@@ -10,12 +10,13 @@ from dualslam.backend.submap_graph import ISam2SubmapGraph
 from dualslam.core.config.settings import GraphConfig, LinkingConfig
 from dualslam.core.events import EventKind
 from dualslam.core.jobs import Ended, InlineDesk, JobKind
+from dualslam.core.noise_model import GROUP
 from dualslam.core.types import Keyframe
 from dualslam.linking.scale_observability import N_AROUND
 from dualslam.map.solving import solve
 from dualslam.map.split import submap_of
 from dualslam.map.submap import Submap
-from dualslam.recovery.scale_watch import BEHIND, GROUP, SCALE_HANDLERS, ScaleLoss, ScaleWatch, count_ties
+from dualslam.recovery.scale_watch import BEHIND, SCALE_HANDLERS, ScaleLoss, ScaleWatch, count_ties
 from dualslam.run.results import trajectories_of
 from dualslam.system.system import System
 from dualslam.testing.link_worlds import FRAME_STEP, Recipe, build, make_world, thinned

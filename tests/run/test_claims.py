@@ -7,8 +7,9 @@ from functools import cache
 
 import numpy as np
 
+from dualslam.core.noise_model import GROUP
 from dualslam.map.submap import Submap
-from dualslam.run.claims import GROUP, claims_of
+from dualslam.run.claims import claims_of
 from dualslam.run.results import frame_rows, trajectories_of
 from dualslam.system.system import System
 from dualslam.testing.point_world import PointWorld, cloud, hand_held, system_in

@@ -14,14 +14,14 @@ import numpy as np
 import pytest
 
 from dualslam.core.errors import InputError
-from dualslam.core.jobs import Executor, InlineDesk, JobKind, Limit
+from dualslam.core.jobs import MAX_WAITING, Executor, InlineDesk, JobKind, Limit
 from dualslam.core.schedule import AT_ONCE, After, Policy, Recorded, header_of
 from dualslam.core.types import Failure, FailureReason
 from dualslam.testing.desk_work import handlers, lane
 from dualslam.testing.lossy import Lossy
 from dualslam.testing.waiting import wait_until
 from dualslam.workers.desk import WorkerDesk
-from dualslam.workers.scheduled_desk import MAX_OPEN, ScheduledDesk
+from dualslam.workers.scheduled_desk import ScheduledDesk
 
 GRAPH, CALIBRATION, WALK = JobKind.GRAPH, JobKind.CALIBRATION, JobKind.WALK
 
@@ -155,14 +155,14 @@ def test_one_job_too_many_ends_at_once_and_does_again() -> None:
         desk = ScheduledDesk(in_process(), policy)
         desk.on_record = rows.append
         desk.begin_frame(0)
-        for number in range(MAX_OPEN + 2):
+        for number in range(MAX_WAITING + 2):
             desk.submit(GRAPH, float(number))
         told = [_told(ended.result) for ended in (*desk.poll(GRAPH), *desk.drain(GRAPH))]
         return told, Recorded.of(rows)
 
     told, record = run(After({GRAPH: 5}))
     assert told[:2] == ["busy"] * 2
-    assert len(told) == MAX_OPEN + 2
+    assert len(told) == MAX_WAITING + 2
     assert run(record)[0] == told
 
 

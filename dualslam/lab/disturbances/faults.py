@@ -147,7 +147,7 @@ def wrong_pose(track: Track, submap: Submap, fault: Corruption) -> FloatArray:
     rng = np.random.default_rng([fault.seed, 0x3053])
     axis, direction = (v / np.linalg.norm(v) for v in rng.standard_normal((2, 3)))
     angle_rad = np.radians(fault.level)
-    ids = track.landmark_ids[track.landmark_ids >= 0]
+    ids = track.seen_ids
     depth_mu = float(np.median(submap.depths(ids, track.T_cam_submap))) if len(ids) else 1.0
     T_error = np.eye(4)
     T_error[:3, :3] = so3.exp(angle_rad * axis)

@@ -89,12 +89,11 @@ class Verdict:
         return f"{self.level}: {' '.join(r.text for r in self.reasons)}" if self.reasons else str(self.level)
 
 
+LEAST_OF_MEDIAN = 0.5
+"""Share of the median speed, or interval, that is expected at least: a camera at rest starts to move, and timestamps
+repeat or come late in turns."""
 NEIGHBOURS = 5
 """Steps on either side whose median speed is expected. Five outvote a frame that is off by itself."""
-MIN_SPEED_SHARE = 0.5
-"""Of the median speed of the whole trajectory, the least that is expected: a camera at rest starts to move."""
-MIN_INTERVAL_SHARE = 0.5
-"""Of the median interval, the least that a step is taken to have lasted: timestamps repeat, or come late in turns."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -112,7 +111,7 @@ def measure_steps(times_s: FloatArray, centres: FloatArray) -> Steps:
     - `centres` (N, 3): of the camera.
     """
     interval_s = np.diff(times_s)
-    least_s = MIN_INTERVAL_SHARE * float(np.median(interval_s[interval_s > 0])) if (interval_s > 0).any() else 1e-9
+    least_s = LEAST_OF_MEDIAN * float(np.median(interval_s[interval_s > 0])) if (interval_s > 0).any() else 1e-9
     interval_s = np.maximum(interval_s, least_s)
     length = np.linalg.norm(np.diff(centres, axis=0), axis=1)
     speed = length / interval_s
@@ -121,5 +120,5 @@ def measure_steps(times_s: FloatArray, centres: FloatArray) -> Steps:
     padded = np.concatenate([np.full(NEIGHBOURS, np.nan), speed, np.full(NEIGHBOURS, np.nan)])
     window = np.lib.stride_tricks.sliding_window_view(padded, 2 * NEIGHBOURS + 1)
     about = np.nanmedian(np.delete(window, NEIGHBOURS, axis=1), axis=1)
-    expected = np.maximum(about, MIN_SPEED_SHARE * float(np.median(speed)))
+    expected = np.maximum(about, LEAST_OF_MEDIAN * float(np.median(speed)))
     return Steps(speed / np.maximum(expected, 1e-12), length - expected * interval_s)

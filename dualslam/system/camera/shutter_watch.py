@@ -26,6 +26,7 @@ from dualslam.core.events import EventKind
 from dualslam.core.geometry import so3
 from dualslam.core.interfaces import Shutter, VisualOdometry
 from dualslam.core.jobs import JobKind
+from dualslam.core.noise_model import GATE_SIGMAS, INFLATION
 from dualslam.core.types import Failure, FloatArray, Track
 from dualslam.map.frame_observations import Change
 from dualslam.map.submap import Submap
@@ -94,11 +95,6 @@ log = logging.getLogger(__name__)
 FIRST_KEYFRAMES, GROWTH, SOON = 15, 2.0, 1.4
 """Keyframes at which a map is asked first, and how many times as many it has at each next time; and where it was
 changed: what it had refused as outliers was by the shutter of before, and the first answer errs towards that."""
-INFLATION = 4.0
-"""How much larger errors are than the residuals say, as neighbouring pixels err alike: as self-calibration has it."""
-MIN_SIGMAS = 3.0
-"""Of these inflated errors, that a readout time must be off for the map to be changed. Global shutters come out at up
-to 1.2 (KITTI, EuRoC), rolling ones at 5 and more."""
 
 MAX_SIGMA_S = 0.004
 """Inflated. If the camera turns too slowly to fix a readout time to this, other errors of the pixels pass for one. A
@@ -207,4 +203,4 @@ def correct_views(buffer: FrameBuffer, shutter: Shutter, camera: Camera) -> None
 def _is_sure(answer: ReadoutEstimate) -> bool:
     """Whether a map is to be changed by what it says."""
     sigma_s = INFLATION * answer.sigma_s
-    return sigma_s < MAX_SIGMA_S and abs(answer.more_s) > MIN_SIGMAS * sigma_s
+    return sigma_s < MAX_SIGMA_S and abs(answer.more_s) > GATE_SIGMAS * sigma_s

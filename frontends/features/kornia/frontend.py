@@ -21,7 +21,7 @@ from dualslam.frontends.features.corners import grades, quadratic_peak, select_s
 from dualslam.frontends.features.groups import NO_MATCHES, best_per_group, consistent_rotation
 from dualslam.frontends.features.images import to_grey, to_rgb
 from dualslam.frontends.features.kornia.matchers import MIN_FEATURES, build_matcher
-from dualslam.frontends.features.kornia.options import LEVELS_ZOOM, NETWORK_TURN_DEG, NETWORK_ZOOM, KorniaOptions
+from dualslam.frontends.features.kornia.options import MAX_ZOOM, NETWORK_TURN_DEG, KorniaOptions
 from dualslam.frontends.features.kornia.weights import Network
 from dualslam.frontends.registry import OptionedFrontend
 
@@ -55,12 +55,12 @@ class KorniaFrontend(OptionedFrontend):
         self._device = choose_device(options.device)
         with torch.random.fork_rng(devices=[]):  # networks are made at random before their weights are read
             if options.is_network:
-                self.scale_factor, self.n_octaves = NETWORK_ZOOM, 1
-                self.max_turn_deg, self.max_zoom = NETWORK_TURN_DEG, NETWORK_ZOOM
+                self.scale_factor, self.n_octaves = MAX_ZOOM, 1
+                self.max_turn_deg, self.max_zoom = NETWORK_TURN_DEG, MAX_ZOOM
                 self._network = Network(options.detector, CANDIDATES * n_features, self._device, options.weights)
             else:
                 self.scale_factor, self.n_octaves = options.scale_factor, options.n_octaves
-                self.max_turn_deg, self.max_zoom = 180.0, LEVELS_ZOOM
+                self.max_turn_deg, self.max_zoom = 180.0, MAX_ZOOM
                 self._levels = LevelFeatures(options, n_features, self._device)
             self._match = build_matcher(options, self._device)
 
@@ -194,7 +194,7 @@ def _unit(descriptors: torch.Tensor) -> NDArray[np.float32]:
 
 PATCH_PX = 32
 """Side of the patch that the descriptor is given: each pixel of the level once."""
-MARGIN_PX = 16
+MARGIN_PX = PATCH_PX // 2
 """Rim of each level without keypoints: half of a patch."""
 NMS_PX = 5
 ORIENTATION_PATCH_PX = 19

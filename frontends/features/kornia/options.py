@@ -16,12 +16,10 @@ from dualslam.core.config.settings import StrictModel
 
 NETWORKS = ("xfeat", "aliked", "disk")
 """One network each that detects and describes, at one scale and without an orientation, and that LightGlue knows."""
-NETWORK_ZOOM = 1.7
+MAX_ZOOM = 1.7
 """A network sees one scale. It bears this change of size, as the published evaluations have it; not measured here."""
 NETWORK_TURN_DEG = 30.0
 """Nor does it know of orientations: it bears about this much turning."""
-LEVELS_ZOOM = 1.7
-"""The change of size that features of a pyramid bear: its coarser half meets the other view's finer half."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,6 +14,7 @@ from dualslam.core.events import EventKind
 from dualslam.core.geometry import se3, so3
 from dualslam.core.interfaces import VisualOdometry
 from dualslam.core.jobs import Ended
+from dualslam.core.noise_model import GATE_SIGMAS, INFLATION
 from dualslam.core.types import Failure, Features, FloatArray, Frame, IntArray, Keyframe, Track, View
 from dualslam.frontends.tracking.map_readout import MIN_KEYFRAMES, ReadoutQuestion, answer_readout, ask_readout
 from dualslam.frontends.tracking.rolling_shutter import TurnMeter
@@ -21,7 +22,6 @@ from dualslam.frontends.tracking.row_shifts import correct_shutter, find_as_read
 from dualslam.frontends.tracking.visual import VisualFrontEnd
 from dualslam.map.submap import Submap
 from dualslam.system.camera import shutter_watch
-from dualslam.system.camera.shutter_watch import INFLATION, MIN_SIGMAS
 from dualslam.system.system import System
 from dualslam.testing.point_world import CAMERA, RATE_HZ, PointWorld, cloud, pose_errors, system_in
 from tests.frontends.tracking.test_rolling_shutter import read_row_by_row, turn_rate
@@ -76,7 +76,7 @@ def test_a_map_tells_the_readout_time(readout_s: float, seed: int) -> None:
     before = {k: T.copy() for k, T in submap.T_submap_kf.items()}
     answer = told(submap, rates)
     assert answer.more_s == pytest.approx(readout_s, abs=0.05 * readout_s + 0.0003)
-    assert answer.more_s > MIN_SIGMAS * INFLATION * answer.sigma_s
+    assert answer.more_s > GATE_SIGMAS * INFLATION * answer.sigma_s
     assert all(np.array_equal(before[k], T) for k, T in submap.T_submap_kf.items())
 
 
@@ -84,7 +84,7 @@ def test_a_map_tells_the_readout_time(readout_s: float, seed: int) -> None:
 def test_a_global_shutter_is_told_as_such(seed: int) -> None:
     answer = told(*made_map(0.0, seed))
     assert abs(answer.more_s) < 0.0003
-    assert abs(answer.more_s) < MIN_SIGMAS * INFLATION * answer.sigma_s
+    assert abs(answer.more_s) < GATE_SIGMAS * INFLATION * answer.sigma_s
 
 
 def test_a_keyframe_that_shares_nothing_is_no_obstacle() -> None:

@@ -1,0 +1,43 @@
+"""Bounds that rooms share: how errors are distributed, and how much evidence a conclusion needs."""
+
+from __future__ import annotations
+
+GATE_SIGMAS = 3.0
+"""Standard deviations at which a comparison fails: chance alone exceeds them once in 370 times."""
+INFLATION = 4.0
+"""How much larger than the residuals say the errors of pixels are taken to be, because neighbouring ones err alike.
+With the exact camera (rendered images) corrections came out up to 3.8 times as far from zero as the Hessian says."""
+MAJORITY = 0.5
+"""Share that must agree. Below a half those that disagree could hold another answer with more support."""
+PROOF_VIEWS = 3
+"""Views that prove a point: two show it on the epipolar line of each other, where anything may be."""
+MIN_CONSENSUS = 12
+"""Matches below which a RANSAC consensus of a 3-point solver is no evidence."""
+MIN_DEPTH_MU = 1e-3
+"""Points nearer to the camera's plane are taken as behind it, and shorter baselines as none. A submap's median depth is
+1 at first."""
+MAX_DEPTH_SIGMA = 0.25
+"""A point's distance counts as known to this relative standard deviation. It is about half a degree of parallax at 1 px
+and a focal length of 700 px."""
+MISSING_INTERVALS = 2.5
+"""Times the usual interval between frames: those further apart have others missing between them."""
+BASELINE_SIGMA = 1e-4
+"""Sigma of a map's first baseline, relative to its length: it holds the scale."""
+CELLS_ACROSS = 16
+"""Cells of an image's width by which observations are spread."""
+MAX_SLIP = 0.1
+"""Share of the way that a map can have lost beyond what its turn and change of scale explain. 32 right loops (HoloLens,
+TUM, 7-Scenes, a phone) lost 3 % at most. The copy of a thing lies a period away, and is neither turned nor scaled."""
+SAME_WITHIN = 0.1
+"""Distance, relative to the size or depth of what is seen, within which two answers are one: twice the 5 % of a wrong
+link."""
+GROUP = 5
+"""Keyframes that see much the same: about as long as a landmark lives on a road. Fewer say little about a place's
+scale, and what lies more than twice as far off shares little with them."""
+SAME_POINT_PX = 3.0
+"""Distance at the finest octave within which two keypoints can be the same point: three sigmas of a well-posed
+landmark's pixel."""
+MIN_LANDMARKS = 6
+"""Landmarks that hold a pose: three fix it, twice as many tell how well."""
+COVISIBLE = 15
+"""Landmarks in common from which two keyframes count as covisible."""
