@@ -8,7 +8,6 @@ from dataclasses import replace
 from dualslam.atlas.record import Record
 from dualslam.core.errors import SolverError
 from dualslam.core.events import EventKind
-from dualslam.core.geometry import se3
 from dualslam.core.interfaces import SubmapGraph
 from dualslam.map.split import shared_landmarks, take_out
 from dualslam.map.submap import Submap
@@ -44,8 +43,8 @@ def hand_frames_over(record: Record, old: Submap, new: Submap) -> None:
     for i, k in anchored.items():
         if k in new.keyframes:
             pose = record.poses[i]
-            T_kf_cam = se3.inverse(old.T_submap_kf[k]) @ old.resolve_anchor(pose.keyframe_id, pose.T_kf_cam)
-            record.poses[i] = replace(pose, submap_id=new.id, keyframe_id=k, T_kf_cam=T_kf_cam)
+            T_submap_cam = old.resolve_anchor(pose.keyframe_id, pose.T_kf_cam)
+            record.poses[i] = replace(pose.at(old.anchored(k, T_submap_cam)), submap_id=new.id)
             if i in record.observations and record.observations[i].submap_id == old.id:
                 record.observations[i] = record.observations[i].in_submap(new.id, id_of)
             if i in record.rows:  # it may be another run's

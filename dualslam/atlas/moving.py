@@ -19,7 +19,7 @@ from dualslam.core.atlas_problem import AtlasSolver
 from dualslam.core.geometry import se3, sim3
 from dualslam.core.interfaces import SubmapGraph, VisualOdometry
 from dualslam.core.types import FloatArray, IntArray
-from dualslam.map.anchors import Anchor, RelativePose
+from dualslam.map.anchors import RelativePose
 from dualslam.map.submap import Submap
 
 REFITTED = 2000
@@ -162,8 +162,7 @@ def bend_submap(submap: Submap, warp: Warp) -> None:
     if culled:
         moved = sim3.act_on_pose(warp.at(culled), np.array(T_culled))
         for k, T in zip(culled, moved, strict=True):
-            stays = submap.keyframe_for(k)
-            submap.anchors[k] = Anchor(stays, se3.inverse(submap.T_submap_kf[stays]) @ T)
+            submap.anchors[k] = submap.anchored(k, T)
     for k, known in submap.relative_poses.items():
         submap.relative_poses[k] = known.scaled(scales[k])
     lm = submap.landmarks

@@ -139,9 +139,7 @@ def pose_frames_anew(record: Record, submap: Submap, shape: float, min_inliers: 
         T_submap_cam = submap.resolve_anchor(pose.keyframe_id, pose.T_kf_cam)
         T_submap_cam_now = record.observations[i].pose(submap, T_submap_cam, shape, min_inliers)
         if T_submap_cam_now is not None:
-            k = submap.keyframe_for(pose.keyframe_id)
-            T_kf_cam = se3.inverse(submap.T_submap_kf[k]) @ T_submap_cam_now
-            record.poses[i] = replace(pose, keyframe_id=k, T_kf_cam=T_kf_cam)
+            record.poses[i] = pose.at(submap.anchored(pose.keyframe_id, T_submap_cam_now))
             n_posed += 1
     return n_posed
 

@@ -8,13 +8,11 @@ of all runs.
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
-from dataclasses import replace
 
 import numpy as np
 
 from dualslam.atlas.atlas import Atlas
 from dualslam.atlas.trajectory import FramePose
-from dualslam.core.geometry import se3
 from dualslam.map.submap import NO_LANDMARK, Submap
 
 MAX_EARLIER_FRAMES = 100_000
@@ -41,9 +39,7 @@ def tidy(atlas: Atlas, poses: Mapping[int, FramePose]) -> dict[int, FramePose]:
 def _re_anchored(pose: FramePose, submap: Submap) -> FramePose:
     if pose.keyframe_id in submap.keyframes:
         return pose
-    k = submap.keyframe_for(pose.keyframe_id)
-    T_submap_cam = submap.resolve_anchor(pose.keyframe_id, pose.T_kf_cam)
-    return replace(pose, keyframe_id=k, T_kf_cam=se3.inverse(submap.T_submap_kf[k]) @ T_submap_cam)
+    return pose.at(submap.anchored(pose.keyframe_id, submap.resolve_anchor(pose.keyframe_id, pose.T_kf_cam)))
 
 
 def _renumber(submap: Submap) -> None:
@@ -60,11 +56,7 @@ def _renumber(submap: Submap) -> None:
 def _drop_anchors(submap: Submap, wanted: Collection[int]) -> None:
     """Forget the culled keyframes that nothing asks for; the others stand on keyframes that are there."""
     for k, anchor in list(submap.anchors.items()):
-        if k not in wanted:
+        if k in wanted:
+            submap.anchors[k] = submap.anchored(k, submap.resolve_anchor(anchor.keyframe_id, anchor.T_kf_cam))
+        else:
             del submap.anchors[k]
-            continue
-        stays = submap.keyframe_for(k)
-        T_submap_kf = submap.resolve_anchor(anchor.keyframe_id, anchor.T_kf_cam)
-        submap.anchors[k] = replace(
-            anchor, keyframe_id=stays, T_kf_cam=se3.inverse(submap.T_submap_kf[stays]) @ T_submap_kf
-        )

@@ -11,6 +11,7 @@ from dualslam.atlas.atlas import Atlas
 from dualslam.core.geometry import sim3, so3
 from dualslam.core.trajectory import Trajectory
 from dualslam.core.types import BoolArray, FloatArray, IntArray
+from dualslam.map.anchors import Anchor
 from dualslam.map.submap import Submap
 
 
@@ -23,6 +24,10 @@ class FramePose:
     submap_id: int
     keyframe_id: int
     T_kf_cam: FloatArray
+
+    def at(self, anchor: Anchor) -> FramePose:
+        """Return the frame where an anchor in the same submap stands."""
+        return replace(self, keyframe_id=anchor.keyframe_id, T_kf_cam=anchor.T_kf_cam)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

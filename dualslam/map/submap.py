@@ -136,6 +136,11 @@ class Submap:
             keyframe_id, T_kf_cam = anchor.keyframe_id, anchor.T_kf_cam @ T_kf_cam
         return self.T_submap_kf[keyframe_id] @ T_kf_cam
 
+    def anchored(self, keyframe_id: int, T_submap_cam: FloatArray) -> Anchor:
+        """Return where a camera stands by a keyframe, or by the one that stands for it since it was culled."""
+        k = self.keyframe_for(keyframe_id)
+        return Anchor(k, se3.inverse(self.T_submap_kf[k]) @ T_submap_cam)
+
     def keyframe_poses(self, keyframe_ids: IntArray | list[int]) -> FloatArray:
         """Return (K, 4, 4) poses, camera to submap."""
         return np.array([self.T_submap_kf[int(k)] for k in keyframe_ids]).reshape(-1, 4, 4)
