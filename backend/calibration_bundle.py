@@ -16,14 +16,12 @@ from dualslam.core.bundle import BundleProblem
 from dualslam.core.camera.corrected import LensCorrection
 from dualslam.core.chi_square import MEDIAN_CHI2
 from dualslam.core.errors import SolverError
-from dualslam.core.noise_model import MIN_DEPTH_MU
+from dualslam.core.noise_model import MAX_TRIES, MIN_DEPTH_MU
 from dualslam.core.types import FloatArray
 
 MAX_ITERATIONS, TOLERANCE = 100, 1e-5
 """Most need a few. Where the focal length is far off, the way is long and bent: lens and focal length make up for each
 other."""
-MAX_DROPS = 3
-"""Times that it is tried again without points that went behind a camera."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -127,7 +125,7 @@ def _in_front(problem: BundleProblem, robust_k: float, lens: Lens, start: FloatA
     Behind a camera a point counts for nothing: where it fits nowhere else, it moves no other variable.
     """
     p, loss = problem, partial(huber, k=robust_k)
-    for _ in range(MAX_DROPS + 1):
+    for _ in range(MAX_TRIES + 1):
         found = optimise(p, loss, MAX_ITERATIONS, TOLERANCE, lens, start, behind_chi2=0.0)
         T, xyz = found.state.T_submap_kf, found.state.xyz_mu
         depth = np.einsum("ri,ri->r", T[p.kf, :3, 2], xyz[p.point] - T[p.kf, :3, 3])

@@ -26,6 +26,7 @@ from dualslam.core.chi_square import CHI2_99, CHI2_999, MEDIAN_CHI2
 from dualslam.core.errors import InputError
 from dualslam.core.geometry import sim3, so3
 from dualslam.core.metric_problem import MeasurementSource, MetricProblem, MetricSolution, pose_by_node
+from dualslam.core.noise_model import ROBUST_N
 from dualslam.core.types import FloatArray
 
 ODOMETRY = ("within", "rollover")
@@ -40,8 +41,6 @@ N_SETTLED = 3
 """Rounds of least squares and hard rejection."""
 UPRIGHT_SIGMA = 0.5
 """Length of the difference between the camera's up and the sky, of a camera that a person or a vehicle carries."""
-N_BESIDE = 5
-"""Positions on either side of a jump of the clock: the median of five survives two outliers."""
 MAX_RUN = 2
 """Neighbouring positions that may be outvoted where the map bends: three are chance once in a million."""
 
@@ -182,11 +181,11 @@ class JointGraph:
                 r, J = self._evaluate(term, self.values)
                 late.append(float(J[-1][:, 0] @ r) / max(float(J[-1][:, 0] @ J[-1][:, 0]), 1e-9))
             steps = [
-                abs(np.median(late[i - N_BESIDE : i]) - np.median(late[i : i + N_BESIDE]))
-                for i in range(N_BESIDE, len(late) - N_BESIDE + 1)
+                abs(np.median(late[i - ROBUST_N : i]) - np.median(late[i : i + ROBUST_N]))
+                for i in range(ROBUST_N, len(late) - ROBUST_N + 1)
             ]
             if steps:
-                found[source] = float(terms[N_BESIDE + int(np.argmax(steps))].reading.t_s)
+                found[source] = float(terms[ROBUST_N + int(np.argmax(steps))].reading.t_s)
         return found
 
     def _tilt(self) -> float:

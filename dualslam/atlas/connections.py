@@ -22,13 +22,11 @@ from dualslam.core.atlas_problem import AtlasSolution, AtlasSolver
 from dualslam.core.errors import SolverError
 from dualslam.core.interfaces import SubmapGraph, VisualOdometry
 from dualslam.core.jobs import Desk, JobKind
+from dualslam.core.noise_model import MAX_TRIES
 from dualslam.core.types import Failure, FailureReason
 from dualslam.map.submap import Submap
 
 log = logging.getLogger(__name__)
-
-MAX_TRIES = 3
-"""How many times a solution is requested in the background, where workers die over it or the map changes under it."""
 
 
 class Connections:

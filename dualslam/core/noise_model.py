@@ -41,3 +41,7 @@ MIN_LANDMARKS = 6
 """Landmarks that hold a pose: three fix it, twice as many tell how well."""
 COVISIBLE = 15
 """Landmarks in common from which two keyframes count as covisible."""
+ROBUST_N = 5
+"""Numbers whose median survives two outliers."""
+MAX_TRIES = 3
+"""Times that what fails by chance is tried in vain before it counts as broken."""

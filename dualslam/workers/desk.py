@@ -23,6 +23,7 @@ from typing import Any
 
 from dualslam.core.errors import ConfigError
 from dualslam.core.jobs import MAX_WAITING, PAUSE_S, Ended, JobKind, Limit
+from dualslam.core.noise_model import MAX_TRIES
 from dualslam.core.types import Failure, FailureReason
 from dualslam.workers.worker import STOP_S, Answer, MakeHandlers, Worker
 
@@ -31,8 +32,6 @@ log = logging.getLogger(__name__)
 
 START_S = 60.0
 """How long a run in real time waits for its workers at most: seconds on a free machine."""
-MAX_STILLBORN = 3
-"""Workers in a row that may end before they were ready: memory may be short for a moment; a script stays wrong."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -81,7 +80,7 @@ class _Queue:
         """
         self.n_stillborn = 0 if worker.was_ready else self.n_stillborn + 1
         worker.stop()
-        if self.n_stillborn > MAX_STILLBORN:
+        if self.n_stillborn > MAX_TRIES:
             raise ConfigError(
                 f"the {self.lane.name} process ends as it starts, {self.n_stillborn} times in a row. A script that "
                 'uses workers runs its code below `if __name__ == "__main__":`, as every process imports it; or set '

@@ -61,7 +61,6 @@ degrees. Some runs found none below 1.5, and ended without a map."""
 
 LAGS = (2, 4, 8, 16, 32, START_REACH)  # frames back that are tried as the first view
 MAX_PAIRS = 2  # tried with each view, in turn: what two views farther apart lack, the next two lack most often as well
-N_WITNESSES = 3  # frames between the two views that must agree
 PROVEN = 1 / 3  # share of the points that are proven, at least: a start is made of these alone
 NEAR = 0.5  # share of the points that a start needs at least which must be near: on a road these fix the motion
 RUNNER_UP = 0.75  # a pose that explains less than this share of what the best one does is out of the question,
@@ -266,7 +265,7 @@ class Initialiser:
 
     def _witnesses(self, first: int, last: int) -> list[View]:
         """Views spread evenly between the two."""
-        between = np.linspace(first, last, N_WITNESSES + 2)[1:-1]
+        between = np.linspace(first, last, PROOF_VIEWS + 2)[1:-1]
         positions = sorted({round(p) for p in between} - {first, last})
         return [self._views[p] for p in positions if len(self._views[p].features) >= MIN_POINTS]
 

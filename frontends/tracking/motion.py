@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from dualslam.core.geometry import se3
+from dualslam.core.noise_model import ROBUST_N
 from dualslam.core.types import FloatArray, Track, View
 
 MAX_EXTRAPOLATION = 3.0
@@ -14,8 +15,6 @@ MAX_EXTRAPOLATION = 3.0
 STEADY_S = 1 / 6
 """For so long it says something in any case: what carries a camera does not turn round in less. Up to four frames of
 30 Hz that came too late are no gap, whatever the interval before them was."""
-N_RECENT = 5
-"""Intervals of which the middle one is the usual one: two stamps may be odd."""
 MIN_SHARE = 0.2
 """Of the usual interval: a nearer stamp tells when a frame came, too late, and its motion took the usual time. Where up
 to three of four frames are left out, the next one is still a quarter away."""
@@ -35,7 +34,7 @@ class Motion:
     def next(self, before: Track, after: Track) -> Motion:
         """Return the motion that follows this one, from one track to the next."""
         interval_s = after.view.timestamp_s - before.view.timestamp_s
-        recent_s = (*self.recent_s, interval_s)[-N_RECENT:]
+        recent_s = (*self.recent_s, interval_s)[-ROBUST_N:]
         usual_s = sorted(recent_s, key=abs)[(len(recent_s) - 1) // 2]
         if abs(interval_s) < MIN_SHARE * abs(usual_s):
             interval_s = usual_s

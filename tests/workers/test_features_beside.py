@@ -7,10 +7,11 @@ import numpy as np
 from dualslam.build import feature_handlers
 from dualslam.core.config.settings import FrontendConfig
 from dualslam.core.jobs import JobKind
+from dualslam.core.noise_model import MAX_TRIES
 from dualslam.core.types import Failure, Frame
 from dualslam.frontends.features.orb import OrbFrontend
 from dualslam.testing.desk_work import lane, working
-from dualslam.workers.desk import MAX_STILLBORN, Lane
+from dualslam.workers.desk import Lane
 from dualslam.workers.start_beside import FeaturesBeside
 from tests.workers.test_stillborn import end_at_once
 
@@ -43,10 +44,10 @@ def test_a_process_that_dies_costs_no_frame() -> None:
 
 def test_processes_that_end_as_they_start_cost_no_frame_and_are_asked_no_more() -> None:
     with working(Lane("features", (JobKind.FEATURES,), end_at_once, 1, 60.0)) as desk:
-        find, n = FeaturesBeside(desk, as_it_is), MAX_STILLBORN + 3
+        find, n = FeaturesBeside(desk, as_it_is), MAX_TRIES + 3
         frames = [find(frame(i, 9)) for i in range(n)]
     assert [f.index for f in frames if f.features is None and f.image is not None] == list(range(n))
-    assert desk.statistics[JobKind.FEATURES].n_done == MAX_STILLBORN + 1
+    assert desk.statistics[JobKind.FEATURES].n_done == MAX_TRIES + 1
 
 
 def test_a_frame_without_an_image_stays_as_it_is() -> None:

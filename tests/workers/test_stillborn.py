@@ -8,8 +8,9 @@ import pytest
 
 from dualslam.core.errors import ConfigError
 from dualslam.core.jobs import Ended, Handlers, JobKind
+from dualslam.core.noise_model import MAX_TRIES
 from dualslam.core.types import Failure
-from dualslam.workers.desk import MAX_STILLBORN, Lane, WorkerDesk
+from dualslam.workers.desk import Lane, WorkerDesk
 
 
 def end_at_once() -> Handlers:
@@ -29,7 +30,7 @@ def test_workers_that_end_as_they_start_are_told_of_and_cost_their_jobs() -> Non
     ended: list[Ended] = []
     with pytest.raises(ConfigError, match=r'walks process ends as it starts.*if __name__ == "__main__"'):
         submit_until(desk, time.monotonic() + 120, ended)
-    assert len(ended) <= MAX_STILLBORN
+    assert len(ended) <= MAX_TRIES
     assert all(isinstance(each.result, Failure) for each in ended)
     desk.submit(JobKind.WALK, "there is no worker left")
     began_s = time.monotonic()

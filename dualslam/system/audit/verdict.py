@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from dualslam.core.noise_model import ROBUST_N
 from dualslam.core.types import FloatArray
 
 MAX_REASONS = 3
@@ -92,8 +93,6 @@ class Verdict:
 LEAST_OF_MEDIAN = 0.5
 """Share of the median speed, or interval, that is expected at least: a camera at rest starts to move, and timestamps
 repeat or come late in turns."""
-NEIGHBOURS = 5
-"""Steps on either side whose median speed is expected. Five outvote a frame that is off by itself."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -115,10 +114,10 @@ def measure_steps(times_s: FloatArray, centres: FloatArray) -> Steps:
     interval_s = np.maximum(interval_s, least_s)
     length = np.linalg.norm(np.diff(centres, axis=0), axis=1)
     speed = length / interval_s
-    if len(speed) <= 2 * NEIGHBOURS:
+    if len(speed) <= 2 * ROBUST_N:
         return Steps(np.zeros(len(speed)), np.zeros(len(speed)))
-    padded = np.concatenate([np.full(NEIGHBOURS, np.nan), speed, np.full(NEIGHBOURS, np.nan)])
-    window = np.lib.stride_tricks.sliding_window_view(padded, 2 * NEIGHBOURS + 1)
-    about = np.nanmedian(np.delete(window, NEIGHBOURS, axis=1), axis=1)
+    padded = np.concatenate([np.full(ROBUST_N, np.nan), speed, np.full(ROBUST_N, np.nan)])
+    window = np.lib.stride_tricks.sliding_window_view(padded, 2 * ROBUST_N + 1)
+    about = np.nanmedian(np.delete(window, ROBUST_N, axis=1), axis=1)
     expected = np.maximum(about, LEAST_OF_MEDIAN * float(np.median(speed)))
     return Steps(speed / np.maximum(expected, 1e-12), length - expected * interval_s)
