@@ -184,7 +184,8 @@ class ReadoutEstimate:
 
 @dataclass(frozen=True, slots=True)
 class FrontendChoice:
-    """The front end that was chosen, and why."""
+    """The front end that was chosen, and why; `n_features` where it needs another number of them."""
 
     name: str
     why: str
+    n_features: int | None = None

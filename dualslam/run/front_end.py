@@ -46,7 +46,8 @@ def with_frontend_chosen(
     else:
         with _faults_unreported():
             choice = find_frontend(config, frames, frames.camera)
-    return config.with_section("frontend", name=choice.name), choice
+    chosen = {"name": choice.name, "n_features": choice.n_features or config.frontend.n_features}
+    return config.with_section("frontend", **chosen), choice
 
 
 @contextmanager

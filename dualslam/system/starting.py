@@ -246,7 +246,8 @@ class Starting:
             record.pose(pose, n, n, seen, FrameMethod.WIDE)
         with record.timer.measure("audit of images"):
             self._state.audit.begin(submap, start.views)
-        record.event(kind, start.views[-1], submap.id, first_view=start.views[0].index, **start.numbers)
+        told = {"frontend": self._state.config.frontend.name, "first_view": start.views[0].index}
+        record.event(kind, start.views[-1], submap.id, **told, **start.numbers)
 
     def _track_in(self, odometry: VisualOdometry, view: View) -> None:
         """Let a new submap be the live one, and reverse tracking start from it."""

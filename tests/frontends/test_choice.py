@@ -1,12 +1,13 @@
-"""Corners where images have them; blobs where they have few, and these start a map."""
+"""Corners where images have them; blobs where they have few and these start a map, and where steps are wide."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import cast
 
 import numpy as np
+import pytest
 
 from dualslam.core.camera.base import Camera
 from dualslam.core.config.files import dump_config
@@ -36,9 +37,12 @@ class StartsAt:
         return cast(Start, view) if self.n_seen == self.n else Failure(FailureReason.LOW_PARALLAX, "")
 
 
-def choice(scene: str, orb_at: int | None, sift_at: int | None) -> tuple[FrontendChoice, StartsAt]:
+def rendered(scene: str) -> list[Frame]:
+    return list(make_sequence(scene, n_frames=N_FRAMES, seed=1, width=320, height=240, supersampling=1.0))
+
+
+def choice(frames: Iterable[Frame], orb_at: int | None, sift_at: int | None) -> tuple[FrontendChoice, StartsAt]:
     """Return the choice, and the starter of SIFT, where each starts a map at its n-th frame."""
-    world = make_sequence(scene, n_frames=N_FRAMES, seed=1, width=320, height=240, supersampling=1.0)
     uv, numbers, octave = np.zeros((0, 2)), np.zeros(0), np.zeros(0, np.int64)
     nothing = Features(uv, uv, numbers, numbers, octave, numbers, np.zeros((0, 1)))
 
@@ -47,26 +51,44 @@ def choice(scene: str, orb_at: int | None, sift_at: int | None) -> tuple[Fronten
 
     corners = Candidate(OrbFrontend(N_FEATURES), StartsAt(orb_at), view_of)
     starter = StartsAt(sift_at)
-    return choose_frontend(world, corners, Candidate(SiftFrontend(N_FEATURES), starter, view_of), N_FEATURES), starter
+    return choose_frontend(frames, corners, Candidate(SiftFrontend(N_FEATURES), starter, view_of), N_FEATURES), starter
 
 
 def test_a_furnished_room_has_corners_and_no_start_is_tried() -> None:
-    chosen, sift = choice("room", orb_at=None, sift_at=1)
+    chosen, sift = choice(rendered("room"), orb_at=None, sift_at=1)
     assert chosen.name == "orb"
     assert sift.n_seen == 0
 
 
+def seen_from(x_px: Iterable[int]) -> list[Frame]:
+    """Return images of one wall of squares, each 320 pixels of it."""
+    squares = np.random.default_rng(0).integers(0, 255, (60, 1000)).astype(np.uint8)
+    wall = squares.repeat(4, axis=0).repeat(4, axis=1)
+    return [Frame(i, i / 30, np.ascontiguousarray(wall[:, x : x + 320])) for i, x in enumerate(x_px)]
+
+
+def test_steps_to_and_fro_that_leave_few_corners_are_left_to_blobs() -> None:
+    chosen, _ = choice(seen_from(250 * (i % 2) for i in range(N_FRAMES)), orb_at=None, sift_at=None)
+    assert (chosen.name, chosen.n_features) == ("sift", 2 * N_FEATURES)
+    assert "100% of the steps are mispredicted" in chosen.why
+
+
+@pytest.mark.parametrize("x_px", [[100 * i for i in range(N_FRAMES)], [80 * (i % 2) for i in range(N_FRAMES)]])
+def test_long_steady_steps_or_corners_that_match_are_left_to_corners(x_px: list[int]) -> None:
+    assert choice(seen_from(x_px), orb_at=None, sift_at=None)[0].name == "orb"
+
+
 def test_on_white_walls_the_first_to_start_a_map_is_chosen() -> None:
-    chosen, _ = choice("ward", orb_at=5, sift_at=4)
+    chosen, _ = choice(rendered("ward"), orb_at=5, sift_at=4)
     assert chosen.name == "sift"
     assert "starts a map first, at frame 3" in chosen.why
-    chosen, sift = choice("ward", orb_at=4, sift_at=4)
+    chosen, sift = choice(rendered("ward"), orb_at=4, sift_at=4)
     assert chosen.name == "orb"
     assert sift.n_seen == 3
 
 
 def test_white_walls_are_left_to_corners_where_no_map_starts() -> None:
-    chosen, sift = choice("ward", orb_at=None, sift_at=None)
+    chosen, sift = choice(rendered("ward"), orb_at=None, sift_at=None)
     assert chosen.name == "orb"
     assert sift.n_seen == N_FRAMES < STARTS_WITHIN
 
