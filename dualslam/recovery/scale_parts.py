@@ -3,22 +3,24 @@
 A map that has lost its scale and goes on may be joined to another by its later, healthy part: by sight, or by reverse
 tracking. What lies beyond the loss hangs on the joined map by nothing, and yet it would be posed in it, ten times too
 large. So each map that is linked is asked once more, at the end of the run, when all that it has seen is in it: from
-its outermost links outward, as far as it hands its scale on. The rest is split off as a submap of its own.
+its links on, as far as it hands its scale on. The rest is split off as a submap of its own, with the links that stand
+there.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from dualslam.atlas.atlas import Atlas
+from dualslam.atlas.atlas import Atlas, Link, joined
 from dualslam.atlas.endings import part_off
 from dualslam.atlas.record import FrameStamp, Record
 from dualslam.core.config.settings import LinkingConfig
 from dualslam.core.events import EventKind
 from dualslam.core.noise_model import GROUP
-from dualslam.core.types import IntArray
+from dualslam.core.types import BoolArray, IntArray
 from dualslam.linking.scale_observability import N_AROUND, answer_scale
 from dualslam.map.landmark_views import noise_excess
 from dualslam.map.split import submap_of
@@ -42,8 +44,8 @@ class _Loss:
 def part_what_lost_its_scale(record: Record, submap_id: int, config: LinkingConfig, now: FrameStamp) -> None:
     """Split off the part of a map beyond a loss of scale, seen from its links.
 
-    A map without a link is left as it is: nothing says which of its parts is the right one. So is what lies between
-    two links: each end has a scale that is known.
+    A map without a link is left as it is: nothing says which of its parts is the right one. So is what other maps tie
+    together: the scale of either part is known there.
 
     - `submap_id`: of a map that is archived.
     - `config`: says by how much a scale must be off to be wrong.
@@ -56,14 +58,34 @@ def part_what_lost_its_scale(record: Record, submap_id: int, config: LinkingConf
     for later in (True, False):
         scales = _Scales(submap)
         outward = scales.ids if later else scales.ids[::-1]
-        outermost = int(np.flatnonzero(np.isin(outward, list(held)))[-1])
-        loss = scales.first_loss(outward[max(outermost - GROUP + 1, 0) :], lost_from(config))
-        if loss is None or _is_held(record.atlas, submap_id, loss.beyond):
+        loss = _outermost_loss(
+            record.atlas, submap_id, scales, outward, np.isin(outward, list(held)), lost_from(config)
+        )
+        if loss is None:
             continue
         rest = sorted([*loss.between.tolist(), *loss.beyond.tolist()])
         if len(rest) > 1:  # a submap has two keyframes at least
             anchor = int(outward[len(outward) - len(rest) - 1])
             _part_off(record, submap, rest, anchor, loss.sigma, now)
+
+
+def _outermost_loss(
+    atlas: Atlas, submap_id: int, scales: _Scales, outward: IntArray, is_held: BoolArray, max_sigma: float
+) -> _Loss | None:
+    """Return the loss of scale farthest out, seen from the link before it, beyond which nothing is tied to the rest.
+
+    `outward` (G,): keyframes; `is_held` (G,): whether a link stands there.
+    """
+    rows = np.flatnonzero(is_held)
+    for first, following in zip(rows[::-1].tolist(), [len(outward), *rows[:0:-1].tolist()], strict=True):
+        if following - first <= SPAN * GROUP and following < len(outward):
+            continue  # the next link is too near for a loss in between
+        for loss in scales.losses(outward[max(first - GROUP + 1, 0) :], max_sigma):
+            if np.isin(loss.between, outward[is_held]).any():
+                break  # it is seen from the next link
+            if not _is_held(atlas, submap_id, loss.beyond):
+                return loss
+    return None
 
 
 class _Scales:
@@ -80,8 +102,8 @@ class _Scales:
         self._excess = noise_excess(submap)
         self.ids = np.array(sorted(submap.keyframes.keys() - submap.condemned), np.int64)
 
-    def first_loss(self, outward: IntArray, max_sigma: float) -> _Loss | None:
-        """Return the first place at which the scale is lost.
+    def losses(self, outward: IntArray, max_sigma: float) -> Iterator[_Loss]:
+        """Yield the places at which the scale is lost, one after the other.
 
         - `outward` (G,): keyframes from a group of those that have the right scale on.
         - `max_sigma`: of the logarithm of the scale, from which on it is lost.
@@ -90,8 +112,7 @@ class _Scales:
         for n in range(1, len(groups)):
             known = max(n - 1 - SPAN, 0)
             if (sigma := self._sigma(groups, known, n, max_sigma)) > max_sigma:
-                return _Loss(outward[GROUP * (known + 1) : GROUP * n], outward[GROUP * n :], sigma)
-        return None
+                yield _Loss(outward[GROUP * (known + 1) : GROUP * n], outward[GROUP * n :], sigma)
 
     def _sigma(self, groups: list[IntArray], known: int, asked: int, max_sigma: float) -> float:
         """Return the standard deviation of the log of the scale of one group against that of another; 0 where firm."""
@@ -114,23 +135,50 @@ def _where_links_stand(atlas: Atlas, submap_id: int) -> set[int]:
     """Return the keyframes of a map at which links to others stand."""
     held: set[int] = set()
     own = atlas.submaps[submap_id].keyframes.keys()
-    for link in atlas.believed:
-        if link.a != link.b and submap_id in (link.a, link.b):
-            at = link.attached(atlas)
-            held |= {at[0] if link.a == submap_id else at[1], *(own & set(link.keyframes))}
+    for link, at in _links_at(atlas, submap_id):
+        held |= {at, *(own & set(link.keyframes))}
     return held
 
 
+def _links_at(atlas: Atlas, submap_id: int) -> Iterator[tuple[Link, int]]:
+    """Yield the believed links of a map to others, each with the keyframe at which it stands."""
+    for link in atlas.believed:
+        if link.a != link.b and submap_id in (link.a, link.b):
+            yield link, link.attached(atlas)[link.b == submap_id]
+
+
 def _is_held(atlas: Atlas, submap_id: int, beyond: IntArray) -> bool:
-    """Whether a loop within the map ties what lies beyond a loss to the rest."""
+    """Whether a loop within the map, or other maps, tie what lies beyond a loss to the rest."""
     loops = (link.attached(atlas) for link in atlas.believed if link.a == link.b == submap_id)
-    return any(np.isin(loop, beyond).sum() == 1 for loop in loops)
+    if any(np.isin(loop, beyond).sum() == 1 for loop in loops):
+        return True
+    others = [link for link in atlas.believed if submap_id not in (link.a, link.b)]
+    set_of = {m: component[0] for component in joined(atlas.submaps, others) for m in component}
+    reached: dict[bool, set[int]] = {True: set(), False: set()}
+    for link, at in _links_at(atlas, submap_id):
+        reached[at in beyond].add(set_of[link.b if link.a == submap_id else link.a])
+    return bool(reached[True] & reached[False])
 
 
 def _part_off(record: Record, submap: Submap, rest: list[int], anchor: int, sigma: float, now: FrameStamp) -> None:
-    """Make the keyframes at one end of a map, and the frames that hang on them, a submap of their own."""
-    part = submap_of(submap, len(record.atlas.submaps), rest)
+    """Make the keyframes at one end of a map a submap of their own, with the frames and links that hang on them."""
+    atlas = record.atlas
+    part = submap_of(submap, len(atlas.submaps), rest)
+    moved = [_moved_to(link, submap, part, link.attached(atlas)) for link in atlas.links]
+    if moved != atlas.links:
+        for m in atlas.component_of(submap.id):
+            atlas.placement.pop(m, None)  # it is composed along its links again
     part_off(record, submap, part, anchor)
+    atlas.links = moved
     frames = sorted(pose.index for pose in record.own_poses() if pose.submap_id == part.id)
     told = {"reason": "scale_lost", "sigma_scale": sigma, "old_submap": part.id, "left": frames}
     record.event(EventKind.CUT, now, submap.id, **told)
+
+
+def _moved_to(link: Link, old: Submap, part: Submap, at: tuple[int, int]) -> Link:
+    """Return a link, of the part where an end of it stands at a keyframe of that; both have the same coordinates."""
+    if link.a == old.id and at[0] in part.keyframes:
+        link = replace(link, a=part.id, keyframe_a=at[0])
+    if link.b == old.id and at[1] in part.keyframes:
+        link = replace(link, b=part.id, keyframe_b=at[1])
+    return link

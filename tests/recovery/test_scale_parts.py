@@ -108,6 +108,24 @@ def test_what_links_hold_on_either_side_is_known() -> None:
     assert not parted(record).events.of_kind(EventKind.CUT)
 
 
+def test_links_to_maps_that_nothing_else_joins_hold_nothing_in_between() -> None:
+    """The part takes its link along; where the other maps are joined, too, both scales are known."""
+    submap = thinned(whole(), PLACE, 0)
+    first, last = min(submap.keyframes), max(submap.keyframes)
+    for joined in (False, True):
+        record = linked(submap.copy(), first)
+        third = submap.copy()
+        third.id = 2
+        record.atlas.add(third)
+        record.atlas.link(Link(0, 2, np.eye(4), np.eye(7), LinkKind.MERGE, keyframe_a=last, keyframe_b=last))
+        if joined:
+            record.atlas.link(Link(1, 2, np.eye(4), np.eye(7), LinkKind.MERGE, keyframe_a=last, keyframe_b=last))
+        cuts = parted(record).events.of_kind(EventKind.CUT)
+        assert len(cuts) == (0 if joined else 1)
+        if not joined:
+            assert sorted(record.atlas.components(), key=len) == [[0, 1], [2, 3]]
+
+
 def test_what_a_loop_holds_is_known() -> None:
     submap = thinned(whole(), PLACE, 0)
     first, last = min(submap.keyframes), max(submap.keyframes)
