@@ -6,7 +6,6 @@ do not. What is believed becomes a link, and the atlas does the rest.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass
 
@@ -23,21 +22,18 @@ from dualslam.core.types import Failure, FailureReason, FloatArray
 from dualslam.map.submap import Submap
 from dualslam.places.plausibility import agree, contradict, plausible
 from dualslam.places.recogniser import PlaceSearch, follow_maps, poses_of
-from dualslam.places.sightings import N_CONFIRMING, PlaceParts, Sightings, record_refusal
+from dualslam.places.set_joins import RECENT, SetJoins
+from dualslam.places.sightings import N_CONFIRMING, SILENT, PlaceParts, Sightings, record_refusal
 from dualslam.places.verification import PlaceMatch
 
 ASK_EVERY = 2
 """Keyframes between two searches, where nothing is provisional: neighbours show the same."""
-RECENT = 20
-"""Keyframes before and after that are no revisit: what is seen there is tracked, or was a moment ago."""
 MAX_MISSES = 3
 """Keyframes that may fail to confirm before the provisional pair is dropped."""
 REST, MAX_REST = 10, 40
 """Keyframes after a loop before the map that it lies in is searched again. Each loop that finds no more drift than the
 map claims doubles them: beside one that was closed a moment ago it tells next to nothing, and costs more the larger the
 map is. At most so many that each submap still comes by a few."""
-_SILENT = (FailureReason.TOO_FEW_MATCHES, FailureReason.TOO_FEW_INLIERS)
-"""Refusals of what only looked alike to the recogniser: they are no events."""
 
 
 @dataclass(slots=True, eq=False)
@@ -72,9 +68,9 @@ class Revisits:
     ) -> None:
         self._record = record
         self._merges = merges
+        self._parts = parts
         self._recogniser = parts.recogniser
         self.sightings = Sightings(record, parts, new_graph, new_relocaliser, config)
-        self._verifier = parts.verifier
         self._connections = connections
         self._desk = desk
         self._config = config
@@ -82,9 +78,12 @@ class Revisits:
         self._believed: _Found | None = None  # waits for what the atlas needs to be solved with it
         self._closing: _Found | None = None  # the atlas is being solved with it
         self._n_asked = 0
-        self._asked_since: dict[int, int] = {}  # by submap, the first keyframe that was asked about while it was live
         self._rest = REST
         self._rests_until = 0  # counted in `_n_asked`; other maps may be found all the same
+
+    @property
+    def _is_enabled(self) -> bool:
+        return self._config.places.enabled and self._config.loops.enabled
 
     # --- keyframes of the live map
 
@@ -93,22 +92,19 @@ class Revisits:
 
         `live`: of which the newest keyframes wait. `at_most`: landmarks in one go, of which 1,000 take 2.5 ms.
         """
-        enabled = self._config.places.enabled and self._config.loops.enabled
-        return self.sightings.take_in(live, at_most) if enabled else 0
+        return self.sightings.take_in(live, at_most) if self._is_enabled else 0
 
     def note_keyframe(
         self,
         live: VisualOdometry,
         at_most: int | None = None,
         among: Collection[int] | None = None,
-        of_other_run: bool = False,
     ) -> None:
         """Search for a place that the live map's reference keyframe shows again; `collect` returns the answer.
 
-        `at_most`: see `take_in`. `among`: the submaps to search; by default all. `of_other_run`: whether these are of
-        another run, whose keyframes are none that were tracked a moment ago.
+        `at_most`: see `take_in`. `among`: the submaps to search, of another run; by default all.
         """
-        if not (self._config.places.enabled and self._config.loops.enabled):
+        if not self._is_enabled:
             return
         self.sightings.end()
         self._n_asked += 1
@@ -120,21 +116,16 @@ class Revisits:
         submap, keyframe_id = live.submap, live.reference_id
         submaps = self._record.atlas.submaps
         if among is None:
-            self._asked_since.setdefault(submap.id, keyframe_id)
             self.take_in(submap, at_most)
         else:
             for m in among:
                 self._recogniser.take_in(submaps[m])
         features = submap.keyframes[keyframe_id].features
-        may_be = self._may_be(submap, keyframe_id, among, of_other_run)
+        may_be = self._may_be(submap, keyframe_id, among)
         candidates = tuple(self._recogniser.query(features, submaps, may_be))
         named = {submap.id, *(candidate.submap_id for candidate in candidates)} if candidates else set()
         search = PlaceSearch(submap.id, keyframe_id, candidates, {m: submaps[m].copy() for m in sorted(named)})
         self._desk.submit(JobKind.LOOP, search, of=submap.id)
-
-    def asked_since(self, submap_id: int) -> float:
-        """Return the keyframe of a submap from which on they were compared with earlier maps; infinity for none."""
-        return self._asked_since.get(submap_id, math.inf)
 
     def take_solution(self, live: VisualOdometry | None, now: FrameStamp) -> AtlasReport | None:
         """Let the maps follow what has been solved meanwhile.
@@ -164,6 +155,20 @@ class Revisits:
         self._take_answers(self._desk.drain(JobKind.LOOP), live, now)
         return self._link_believed(live, now) or report
 
+    def join_rest(self, own: Collection[int], now: FrameStamp) -> None:
+        """Join sets of submaps that are apart when the run is over, by all places that they share.
+
+        `own`: the submaps of this run; they are compared with all.
+        """
+        if not (self._merges and self._is_enabled) or len(self._record.atlas.components()) < 2:
+            return
+        self.take_in(None)
+        joins = SetJoins(self._record, self._parts, own, now)
+        while (found := joins.next()) is not None:
+            link = self._link_of(found.match)
+            report = self._connections.connect([link], now)
+            self._linked(_Found(found.match, found.confirmations, kind=link.kind), report, None, now)
+
     def _take_answers(self, answers: Iterable[Ended], live: VisualOdometry | None, now: FrameStamp) -> None:
         for ended in answers:
             search: PlaceSearch = ended.work
@@ -178,6 +183,8 @@ class Revisits:
         refused: tuple[int, int, Failure] | None = None
         for candidate, result in zip(search.candidates, results, strict=True):
             match = result
+            if isinstance(match, PlaceMatch) and match.doubt is not None:
+                match = match.doubt
             if not isinstance(match, Failure):
                 then = poses_of(match, search.submaps)
                 followed = None if then is None else follow_maps(match, then, self._record.atlas.submaps)
@@ -186,7 +193,7 @@ class Revisits:
                 match = plausible(self._record, followed)
             if not isinstance(match, Failure):
                 found.append(match)
-            elif match.reason not in _SILENT and refused is None:
+            elif match.reason not in SILENT and refused is None:
                 refused = candidate.submap_id, candidate.keyframe_id, match
         if not found:
             if refused is not None:  # the best of them: one event for a keyframe
@@ -202,14 +209,12 @@ class Revisits:
                 return None
         return best
 
-    def _may_be(
-        self, submap: Submap, keyframe_id: int, among: Collection[int] | None, of_other_run: bool
-    ) -> Callable[[int, int], bool]:
+    def _may_be(self, submap: Submap, keyframe_id: int, among: Collection[int] | None) -> Callable[[int, int], bool]:
         """Return which keyframes would be a revisit: not those that are tracked, or were a moment ago."""
         seen_now = set(submap.covisible(submap.seen_in(keyframe_id))[0].tolist())
         arrived = sorted({k for m in self._record.atlas.submaps.values() for k in m.keyframes})
         at = arrived.index(keyframe_id)
-        recent = {*arrived[max(at - RECENT, 0) : at + RECENT + 1], *seen_now} if not of_other_run else set()
+        recent = {*arrived[max(at - RECENT, 0) : at + RECENT + 1], *seen_now} if among is None else set()
         joined = set(self._record.atlas.component_of(submap.id))
         rests = self._n_asked < self._rests_until
 

@@ -26,6 +26,8 @@ YOUNG = 5
 """Newest keyframes of the live submap whose own landmarks are not remembered yet: half of them will be culled."""
 SAME_TURN_RAD = float(np.radians(6.0))
 """The same for its rotation: twice 3 degrees."""
+SILENT = (FailureReason.TOO_FEW_MATCHES, FailureReason.TOO_FEW_INLIERS)
+"""Refusals of what only looked alike to the recogniser: they are no events."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -74,6 +74,7 @@ class PlaceMatch:
     n_matches: int
     n_inliers: int
     numbers: dict[str, float] = field(default_factory=dict)
+    doubt: Failure | None = None  # why scale or position may not be relied on; None where they may
 
 
 class PlaceVerifier:
@@ -246,7 +247,8 @@ class PlaceVerifier:
             JoinGate.at_least("spread", spread, MIN_IMAGE_SPREAD, FailureReason.SPREAD, covered),
             *similarity_gates(*known, self._config),
         ]
-        refused = LinkEvidence.of(gates).doubt(numbers)
+        judged = LinkEvidence.of(gates)
+        refused = judged.refusal(numbers)
         if refused is not None:
             return refused
         second = self._second_pose(place, query, S, rng)
@@ -268,6 +270,7 @@ class PlaceVerifier:
             len(inliers),
             n,
             numbers,
+            judged.doubt(numbers),
         )
 
     def _second_pose(self, place: Side, query: Side, S: FloatArray, rng: Generator) -> SecondSimilarity | None:

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable
 
 from dualslam.atlas.record import FrameStamp
 from dualslam.atlas.report import AtlasReport
@@ -93,37 +92,21 @@ class PlaceKeeping:
         """
         now = None
         for m in submap_ids:
-            keyframes = self._state.record.atlas.submaps[m].keyframes
-            now = FrameRow(newest := max(keyframes), keyframes[newest].timestamp_s, FrameStatus.TRACKED)
-            self._ask(m, dict.fromkeys(keyframes, among), now, of_other_run=True)
+            submap = self._state.record.atlas.submaps[m]
+            newest = max(submap.keyframes)
+            now = FrameRow(newest, submap.keyframes[newest].timestamp_s, FrameStatus.TRACKED)
+            asking = self._state.parts.new_relocaliser(submap, self._state.parts.new_graph())
+            for k in sorted(submap.keyframes.keys() - submap.condemned):
+                asking.start_at(k)
+                with self._state.record.timer.measure("places"):
+                    self._revisits.note_keyframe(asking, among=among)
+                    self._revisits.finish(asking, now)
         return now
 
     def join_rest(self, own: Collection[int], now: FrameStamp) -> None:
-        """Link archived submaps of this run that are still apart from the largest set, where they show other maps.
-
-        A keyframe was compared with what was mapped before it, unless reverse tracking has made it. What is left are
-        the maps that came later.
-        """
-        atlas, poses = self._state.record.atlas, self._state.record.own_poses()
-        n_frames = Counter(pose.submap_id for pose in poses)
-        sets = sorted(atlas.components(), key=lambda component: -sum(n_frames[m] for m in component))
-        for m in (m for component in sets[1:] for m in component if m in own):
-            others = atlas.submaps.keys() - set(atlas.component_of(m))
-            later, since = {other for other in others if other > m}, self._revisits.asked_since(m)
-            self._ask(m, {k: others if k < since else later for k in atlas.submaps[m].keyframes}, now)
-
-    def _ask(self, m: int, among: Mapping[int, Collection[int]], now: FrameStamp, of_other_run: bool = False) -> None:
-        """Compare keyframes of an archived submap with other submaps: each with those that `among` names."""
-        state = self._state
-        submap = state.record.atlas.submaps[m]
-        asking = state.parts.new_relocaliser(submap, state.parts.new_graph())
-        for k in sorted(submap.keyframes.keys() - submap.condemned):
-            if not among[k]:
-                continue
-            asking.start_at(k)
-            with state.record.timer.measure("places"):
-                self._revisits.note_keyframe(asking, among=among[k], of_other_run=of_other_run)
-                self._revisits.finish(asking, now)
+        """Join this run's submaps that are still apart, where they show the same places; `own`: their ids."""
+        with self._state.record.timer.measure("places"):
+            self._revisits.join_rest(own, now)
 
     # --- a place that an earlier run has mapped
 
