@@ -37,7 +37,7 @@ LOG_ZOOMS = tuple(round(0.1 * step, 1) for step in range(-7, 8))
 """Factors on the focal length, from a half to two. Near the true one, frames match most points of the map. Far from it
 they match those that fit the wrong focal length, and these say that little is wrong."""
 N_TRIES = 6
-"""Refinements of the best factor: each takes the greater part of what is left."""
+"""Refinements of the best factor, to within its sigma: each takes a part of what is left."""
 N_ITERATIONS = 20
 HUBER = 2.0
 """Sigmas. The frames were matched by the wrong focal length, so that many residuals are larger."""
@@ -84,17 +84,16 @@ def camera_that_fits(config: Config, frames: Iterable[Frame], camera: Camera, sa
     for _ in range(N_TRIES):
         tried, seen = seen_with(zoom)
         found = log_focal_of(seen)
-        if found is None:
+        if found is None or abs(found[0]) <= found[1]:
             break
-        if _agrees(*found):
-            f = own_focal_px(camera)
-            log.warning(
-                "the frames fit the saved map with a focal length of %.0f px, not %.0f: it is taken for theirs",
-                f * math.exp(zoom),
-                f,
-            )
-            return tried
         zoom += found[0]
+    if found is not None and _agrees(*found):
+        log.warning(
+            "the frames fit the saved map with a focal length of %.0f px, not %.0f: it is taken for theirs",
+            own_focal_px(tried),
+            own_focal_px(camera),
+        )
+        return tried
     raise InputError(
         "The frames do not fit the saved map with any focal length: their camera is another one than "
         "they are said to be of; give its calibration (--camera)."
