@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -272,7 +273,7 @@ class TestMapping:
     @pytest.mark.parametrize(("in_haste", "n_calls"), [(False, 2), (True, 0)])
     def test_a_keyframe_in_haste_aligns_no_patches(self, world: PointWorld, in_haste: bool, n_calls: int) -> None:
         live, aligned = front_end(world, [0, 4, 8], start_at=8), list[int]()
-        live._align = lambda rows: aligned.append(len(rows))  # type: ignore[method-assign]
+        live._alignment = SimpleNamespace(refine=lambda submap, rows: aligned.append(len(rows)))  # type: ignore[assignment]
         for i in range(9, 16):
             track = tracked(live, world.view(i))
         live.insert_keyframe(track, in_haste)
