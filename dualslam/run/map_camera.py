@@ -36,6 +36,8 @@ second keeps frames of a flat scene from counting."""
 LOG_ZOOMS = tuple(round(0.1 * step, 1) for step in range(-7, 8))
 """Factors on the focal length, from a half to two. Near the true one, frames match most points of the map. Far from it
 they match those that fit the wrong focal length, and these say that little is wrong."""
+FAR_ZOOM = 0.5
+"""Log factor beyond which frames of the map may not be found at all by the wrong focal length."""
 N_TRIES = 6
 """Refinements of the best factor, to within its sigma: each takes a part of what is left."""
 N_ITERATIONS = 20
@@ -66,11 +68,8 @@ def camera_that_fits(config: Config, frames: Iterable[Frame], camera: Camera, sa
     if known is None:
         return camera
     config = config.with_section("recovery", workers=0)
-    found = log_focal_of(_frames_in_map(config, frames, camera, load_atlas(saved_map)))
-    if found is None:
-        log.info("the saved map is not seen in the first frames: nothing tells whether their camera is right")
-        return camera
-    if _agrees(*found):
+    as_given = log_focal_of(_frames_in_map(config, frames, camera, load_atlas(saved_map)))
+    if as_given is not None and _agrees(*as_given):
         return camera
 
     def seen_with(log_zoom: float) -> tuple[Camera, list[_Seen]]:
@@ -80,7 +79,8 @@ def camera_that_fits(config: Config, frames: Iterable[Frame], camera: Camera, sa
             return camera, []
         return tried, _frames_in_map(config, frames, tried, load_atlas(saved_map))
 
-    zoom = max(LOG_ZOOMS, key=lambda log_zoom: sum(len(s.xyz) for s in seen_with(log_zoom)[1]))
+    zooms = [log_zoom for log_zoom in LOG_ZOOMS if as_given is not None or abs(log_zoom) >= FAR_ZOOM]
+    zoom = max(zooms, key=lambda log_zoom: sum(len(s.xyz) for s in seen_with(log_zoom)[1]))
     for _ in range(N_TRIES):
         tried, seen = seen_with(zoom)
         found = log_focal_of(seen)
@@ -94,6 +94,9 @@ def camera_that_fits(config: Config, frames: Iterable[Frame], camera: Camera, sa
             own_focal_px(camera),
         )
         return tried
+    if as_given is None:
+        log.info("the saved map is not seen in the first frames: nothing tells whether their camera is right")
+        return camera
     raise InputError(
         "The frames do not fit the saved map with any focal length: their camera is another one than "
         "they are said to be of; give its calibration (--camera)."
