@@ -121,8 +121,8 @@ class PatchAlignment:
     def _pairs(self, submap: Submap, rows: IntArray) -> _Pairs:
         """Return the observations that have a reference, each with it.
 
-        The reference is the observation that first described the landmark. Where its image is not kept, or shows the
-        landmark in another size, it is the farthest in time of those that are not to be moved now.
+        The reference is the observation that first described the landmark. Its image may not be kept, or show the
+        landmark in another size. Then it is the farthest in time of those that stay where they are.
         """
         obs, ids = submap.observations, np.array([k for k in submap.keyframes if k in self._images], np.int64)
         to_depth = np.full((int(max(submap.keyframes)) + 1, 4), np.nan)

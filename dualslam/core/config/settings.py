@@ -16,8 +16,8 @@ class FrontendConfig(StrictModel):
     """Features and their comparison."""
 
     name: str = "auto"
-    """Which front end: `auto`, `orb`, `sift`, `gms`, `kornia` (an extra), or one that another package offers as an
-    entry point of `dualslam.frontends`; or `module:Class`, of what can be imported. `auto` is `sift` where the first
+    """Which front end: `auto`, `orb`, `sift`, `gms`, `kornia` (an extra), or `module:Class`, of what can be imported.
+    Another package may offer one as an entry point of `dualslam.frontends`. `auto` is `sift` where the first
     images show few corners and it is the first to start a map, or steps are wide; else `orb`."""
     n_features: int = Field(1000, ge=50, le=20000)
     """Keypoints per image."""
