@@ -57,9 +57,6 @@ REBUILD_ATTEMPTS = 8
 RELINEARISE_EVERY = 3
 MISFIT_CHI2 = 1.2
 """Each third update relinearises, and each that follows one whose newest observations fit worse than this."""
-SETTLING_STEPS = 3
-"""Further steps at most of an update of a young map. With none its scale comes out 2 % too small, and what agrees with
-the optimum counts as outlier."""
 FAR_MU = 200.0
 """A point this far from its camera (the median initial depth is 1) is looked at again before the next solution."""
 
@@ -284,18 +281,14 @@ class ISam2SubmapGraph:
     def _solve(self, solver: IncrementalSolver, submap: Submap, plan: Plan, changes: _Changes) -> None:
         """Let the solver take the changes in, and note the factor indices that it gives."""
         newest = list(submap.keyframes)[-N_LAST:]
-        due = submap.is_young or self._n_updates % RELINEARISE_EVERY == 0 or self._misfit
+        due = self._n_updates % RELINEARISE_EVERY == 0 or self._misfit
         indices = solver.update(changes.graph, changes.values, changes.remove, newest, due)
-        steps = [solver.statistics]
-        while submap.is_young and solver.statistics.relinearised and len(steps) <= SETTLING_STEPS:
-            solver.update(gtsam.NonlinearFactorGraph(), gtsam.Values(), [], newest, True)
-            steps.append(solver.statistics)
         projections = len(indices) - len(changes.order)
         self._ties.note(changes.ties, indices[:projections])
         factors = np.empty(len(changes.order), np.int64)
         factors[changes.order] = indices[projections:]
         self._factor_index.commit(plan, factors)
-        self.statistics = tuple(steps)
+        self.statistics = (solver.statistics,)
 
     def _n_rows(self, submap: Submap, plan: Plan, keyframe_id: int) -> int:
         kf = submap.observations["kf"]

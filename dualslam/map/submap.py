@@ -14,8 +14,6 @@ from dualslam.map.anchors import Anchor, RelativePose
 from dualslam.map.tables import Table, landmark_table, observation_table
 
 NO_LANDMARK = -1
-YOUNG_MAP = 10
-"""Keyframes up to which a map is young: its landmarks have few views and are noisy, and a keyframe moves all others."""
 
 
 class Submap:
@@ -88,11 +86,6 @@ class Submap:
         return submap
 
     # --- keyframes
-
-    @property
-    def is_young(self) -> bool:
-        """Whether it has at most `YOUNG_MAP` keyframes."""
-        return len(self.keyframes) <= YOUNG_MAP
 
     def add_keyframe(self, keyframe: Keyframe, T_submap_kf: FloatArray) -> None:
         """Insert a keyframe without observations."""

@@ -21,7 +21,6 @@ from dualslam.core.types import Failure, FailureReason, FloatArray, IntArray, Tr
 from dualslam.frontends.features.matching import FeatureGrid, match_projected
 from dualslam.frontends.gap.second_pose import refuse_second_pose
 from dualslam.frontends.gap.uncertainty import refuse_lost_scale
-from dualslam.frontends.tracking.landmark_noise import refine_with_landmarks
 from dualslam.frontends.tracking.local_map import LocalMap, Prediction, covering_keyframes, trusted
 from dualslam.frontends.tracking.motion import Motion
 from dualslam.frontends.tracking.pixel_search import PixelSearch
@@ -395,14 +394,15 @@ class Tracker:
         landmark_ids, visible = self._search(local, view, grid, T_cam_submap, landmark_ids)
         feature = np.flatnonzero(landmark_ids >= 0)
         ids = landmark_ids[feature]
-        uv_px, sigma_px = features.uv_rect_px.take(feature, axis=0), features.sigma_px[feature]
-        counted = trusted(submap, ids, T_cam_submap, self._config.min_inliers)
-        xyz_mu = submap.landmarks["xyz_mu"].take(ids, axis=0)
         estimate = refine_pose(
-            submap.K, T_cam_submap, xyz_mu, uv_px, sigma_px, tolerance=POSE_TOLERANCE, counted=counted
+            submap.K,
+            T_cam_submap,
+            submap.landmarks["xyz_mu"].take(ids, axis=0),
+            features.uv_rect_px.take(feature, axis=0),
+            features.sigma_px[feature],
+            tolerance=POSE_TOLERANCE,
+            counted=trusted(submap, ids, T_cam_submap, self._config.min_inliers),
         )
-        if isinstance(estimate, PoseEstimate) and submap.is_young:
-            estimate = refine_with_landmarks(submap, ids, estimate, uv_px, sigma_px, counted)
         if isinstance(estimate, Failure):
             return estimate
         if estimate.n_inliers < self._config.min_inliers:

@@ -36,6 +36,7 @@ REBUILD_SPACING = 8
 
 CULL_BEHIND = 2  # the newest keyframes are not judged redundant: the next ones may need them
 N_CULL_CANDIDATES = 10  # of the covisible keyframes, the nearest in what they see
+YOUNG_MAP = 10  # keyframes up to which the graph poses each: two or three say little about a fourth
 MIN_WINDOW_MATCHES = 40  # landmarks of a keyframe below which a window of its neighbours may be led astray
 
 
@@ -298,8 +299,7 @@ class VisualFrontEnd:
     def _pose(self, track: Track, n_matched: int, pose_is_given: bool) -> GraphEstimate:
         """Pose the new keyframe, and drop what contradicts it."""
         careful = self._careful or pose_is_given or track.wide or self._window is None
-        # In a young map two or three keyframes say little about a fourth.
-        if not (careful or self.submap.is_young) and n_matched >= MIN_WINDOW_MATCHES:
+        if not careful and len(self.submap.keyframes) > YOUNG_MAP and n_matched >= MIN_WINDOW_MATCHES:
             assert self._window is not None
             posed = self._window(self.submap, [track.view.index, *reversed(self._path[1 - N_WINDOW :])])
             if not isinstance(posed, Failure):

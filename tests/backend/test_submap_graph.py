@@ -7,7 +7,6 @@ import pytest
 
 from dualslam.backend import submap_graph
 from dualslam.backend.local_ba import bundle_adjust
-from dualslam.backend.solver import POSE_THRESHOLDS
 from dualslam.backend.submap_graph import ISam2SubmapGraph
 from dualslam.backend.window import NumpyWindowSolver
 from dualslam.core.config.settings import GraphConfig
@@ -16,8 +15,8 @@ from dualslam.core.geometry import se3, so3
 from dualslam.map.anchors import RelativePose
 from dualslam.testing.graph_scene import Feeder, make_scene, pose_errors
 
-OPTIMUM_MU, OPTIMUM_RAD = POSE_THRESHOLDS[1], 5e-3
-"""How far iSAM2, which does not relinearise what moves by less, may be from the batch optimum: less than the standard
+OPTIMUM_MU, OPTIMUM_RAD = 5e-3, 5e-3
+"""How far iSAM2, which does not relinearise what moves little, may be from the batch optimum: less than the standard
 deviation of the last pose, and nowhere more than one standard deviation of the same pose."""
 
 
@@ -163,7 +162,7 @@ def test_the_outliers_gate_follows_the_noise_that_residuals_have(noise, gauged):
     judged = np.isin(obs["landmark"], e.landmark_ids) & (n_views[obs["landmark"]] >= 6)
     is_wrong = np.array([pair in wrong for pair in zip(obs["kf"].tolist(), obs["feature"].tolist(), strict=True)])
     is_out = np.isin(np.arange(len(obs)), e.outlier_rows)
-    assert is_out[judged & is_wrong].mean() > 0.85
+    assert is_out[judged & is_wrong].mean() > 0.88
     assert is_out[judged & ~is_wrong].mean() < 0.03
 
 

@@ -279,8 +279,7 @@ def test_the_lost_map_has_been_found_again_meanwhile(world: PointWorld, again: b
     assert system._recoveries.waiting == ([0] if again else [])
 
 
-def test_a_link_that_leaps_must_hold_anew(monkeypatch: pytest.MonkeyPatch) -> None:
-    world = PointWorld(cloud(600), hand_held(97), covered=COVERED)
+def test_a_link_that_leaps_must_hold_anew(world: PointWorld, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("dualslam.recovery.manager.judge_motion", lambda _: LEAP)
     monkeypatch.setattr("dualslam.recovery.schedule.tightened", lambda *_: 0.0)  # sure as it may be, it holds twice
     system, frames = late_system(world, 12), iter(world.frames())
@@ -295,7 +294,7 @@ def test_a_link_that_leaps_must_hold_anew(monkeypatch: pytest.MonkeyPatch) -> No
 def test_a_link_that_leaps_is_tried_again_as_its_map_grows(world: PointWorld, monkeypatch: pytest.MonkeyPatch) -> None:
     leaps = [LEAP]
     monkeypatch.setattr("dualslam.recovery.manager.judge_motion", lambda _: leaps.pop() if leaps else LinkEvidence(()))
-    system = late_system(world, 1, recovery={"enabled": True, "retry_keyframes": [3]})
+    system = late_system(world, 1, recovery={"enabled": True, "retry_keyframes": [4]})
     for frame in world.frames():
         system.step(frame)
     first, again = system.events.of_kind(EventKind.RECOVERY_STARTED)

@@ -119,7 +119,7 @@ def test_places_are_asked_for_with_the_frame_after_a_keyframe_that_comes_in_time
 def test_in_real_time_no_frame_takes_more_than_its_share_of_landmarks_into_the_index(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    world = PointWorld(cloud(), hand_held(70))
+    world = PointWorld(cloud(), hand_held(40))
     system = system_in(world, keyframes={"max_parallax_deg": 1.0})
     index = system._revisits._recogniser
     monkeypatch.setattr("dualslam.system.places.TAKEN_IN_A_FRAME", 20)
