@@ -1,6 +1,6 @@
 """Measure what README, docs/index.md and docs/results.md claim, and write the tables there, each with its commit.
 
-    python benchmarks/results.py --data DIR [--part sequences] [--part failures] [--part links]
+    python benchmarks/results.py --data DIR [--part sequences] [--part realtime] [--part failures] [--part links]
                                  [--seeds 5] [--trials 4] [--worlds 8] [--jobs 2] [--out runs/results] [--write-only]
 
 `make results DATA=DIR` is the same. DIR holds `kitti_03`, `7scenes_1000`, `tum_fr1_rpy` and `hololens_000`, each with
@@ -18,6 +18,7 @@ import re
 import statistics
 import subprocess
 import sys
+from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -25,12 +26,22 @@ from typing import Any
 import yaml
 
 ROOT = Path(__file__).resolve().parent.parent
-PARTS = ("sequences", "failures", "links")
+PARTS = ("sequences", "realtime", "failures", "links")
 FIRST_SEED = 100
 CONDITIONS: dict[str, list[str]] = {"": [], "recovery off": ["--no-recovery"]}
 BLACK = ("kitti_03", "7scenes_1000")
 BLACK_FRAMES = 10
 SHORT = "failures in short"
+BESIDE = "beside ORB-SLAM3"
+PEER = {
+    "kitti_03": "99.9, 0.81, 95",
+    "7scenes_1000": "97.2, 0.041, 48",
+    "tum_fr1_rpy": "81.7, 0.057, 36",
+    "euroc_takeoff": "77.1, 0.0079, 49",
+    "hololens_000": "21.2, 0.15, 23",
+}
+"""ORB-SLAM3 (`pyorbslam3` 0.1.1, a vocabulary of 88,000 descriptors) at the camera's rate on two cores, in
+November 2026: coverage in %, ATE in m, CPU ms a frame."""
 
 
 def main() -> None:
@@ -52,7 +63,7 @@ def main() -> None:
     for part in parts:
         begin(args.out, part, commit)
     for part in parts:
-        {"sequences": measure_sequences, "failures": measure_failures, "links": measure_links}[part](args)
+        MEASURE[part](args)
     write(args.out)
 
 
@@ -78,13 +89,28 @@ def measure_sequences(args: argparse.Namespace) -> None:
     runs: list[tuple[object, ...]] = []
     for folder in sorted(path for path in args.data.iterdir() if (path / "images").is_dir()):
         for condition, options in [*CONDITIONS.items(), *_black(folder, args.out)]:
-            for seed in range(FIRST_SEED, FIRST_SEED + args.seeds):
-                out = args.out / "sequences" / folder.name / (condition or "as it is") / str(seed)
-                if not (out / "summary.json").exists():
-                    runs.append(("run", str(folder), "--out", out, "--overwrite", "--quiet", "--seed", seed, *options))
+            runs += _runs(args, folder, Path("sequences", folder.name, condition or "as it is"), options)
     with ThreadPoolExecutor(args.jobs) as pool:
         for _ in pool.map(lambda run: _run(*run), runs):  # one that fails ends those that have not begun
             pass
+
+
+def measure_realtime(args: argparse.Namespace) -> None:
+    """Run the sequences of `PEER` at the camera's rate, one after the other."""
+    for name in PEER:
+        for run in _runs(args, args.data / name, Path("realtime", name), ["--realtime", "--workers", "1"]):
+            _run(*run)
+
+
+def _runs(args: argparse.Namespace, folder: Path, place: Path, options: list[str]) -> list[tuple[object, ...]]:
+    """Return the runs of a sequence that are missing, one for each seed."""
+    seeds = range(FIRST_SEED, FIRST_SEED + args.seeds)
+    outs = {seed: args.out / place / str(seed) for seed in seeds}
+    return [
+        ("run", folder, "--out", out, "--overwrite", "--quiet", "--seed", seed, *options)
+        for seed, out in outs.items()
+        if not (out / "summary.json").exists()
+    ]
 
 
 def _black(folder: Path, out: Path) -> list[tuple[str, list[str]]]:
@@ -111,6 +137,14 @@ def measure_links(args: argparse.Namespace) -> None:
     subprocess.run([*map(str, command), "--runs", str(args.worlds), "--jobs", str(args.jobs)], check=True, cwd=ROOT)
 
 
+MEASURE = {
+    "sequences": measure_sequences,
+    "realtime": measure_realtime,
+    "failures": measure_failures,
+    "links": measure_links,
+}
+
+
 def _run(*arguments: object) -> None:
     done = subprocess.run([sys.executable, "-m", "dualslam.cli", *map(str, arguments)], check=False, cwd=ROOT)
     if done.returncode not in (0, 1):  # 1: no map, which is a result
@@ -126,9 +160,16 @@ def _git(*arguments: str) -> str:
 
 def write(out: Path) -> None:
     """Put the tables that were measured into README.md and two pages of docs, between their marks."""
-    tables = {"sequences": sequences_table(out), "failures": failures_tables(out), "links": links_table(out)}
-    tables[SHORT] = short_table(tables["failures"])
-    for page, parts in (("README.md", (SHORT,)), ("docs/index.md", (SHORT,)), ("docs/results.md", PARTS)):
+    realtime = {name: _read(out / "realtime" / name) for name in PEER}
+    tables = {
+        "sequences": sequences_table(out),
+        "realtime": realtime_table(realtime),
+        "failures": failures_tables(out),
+        "links": links_table(out),
+    }
+    tables[SHORT], tables[f"realtime {BESIDE}"] = short_table(tables["failures"]), beside_table(realtime)
+    short = (SHORT, f"realtime {BESIDE}")
+    for page, parts in (("README.md", short), ("docs/index.md", short), ("docs/results.md", PARTS)):
         text = (ROOT / page).read_text()
         for part in parts:
             if table := tables[part]:
@@ -151,28 +192,88 @@ def _filled(text: str, part: str, content: str) -> str:
 def sequences_table(out: Path) -> str | None:
     """Return a row for each sequence and condition: medians over the seeds, the worst in brackets."""
     rows = []
-    for condition in sorted((out / "sequences").glob("*/*"), key=lambda path: (path.parent.name, path.name)):
-        runs = [json.loads(path.read_text()) for path in sorted(condition.glob("*/summary.json"))]
+    for folder in sorted((out / "sequences").glob("*/*"), key=lambda path: (path.parent.name, path.name)):
+        if runs := _read(folder):
+            joined = sum(run["recoveries"] + run["relocalised"] for run in runs)
+            lost = str(sum(run["failures"] for run in runs))
+            cells = (
+                folder.parent.name,
+                folder.name,
+                *_quality(runs),
+                lost,
+                str(joined),
+                _median([run["cpu_ms_per_frame"] for run in runs], max, 0),
+            )
+            rows.append(_line(cells))
+    names = ("sequence", "condition", *QUALITY, "maps lost", "joined again", "CPU ms a frame")
+    return "\n".join([_line(names), "|" + "---|" * len(names), *rows]) if rows else None
+
+
+def realtime_table(realtime: dict[str, list[dict[str, Any]]]) -> str | None:
+    """Return a row for each sequence at the camera's rate."""
+    rows = []
+    for name, runs in realtime.items():
         if runs:
-            rows.append(_sequence_row(condition.parent.name, condition.name, runs))
-    if not rows:
+            latency = (_median([run["latency_ms"][q] for run in runs], max, 0) for q in ("median", "p99"))
+            dropped = _median([100 * run["dropped"] / run["frames"] for run in runs], max, 1)
+            cells = (
+                name,
+                *_quality(runs),
+                dropped,
+                *latency,
+                _median([run["cpu_ms_per_frame"] for run in runs], max, 0),
+                PEER[name],
+            )
+            rows.append(_line(cells))
+    names = (
+        "sequence",
+        *QUALITY,
+        "dropped %",
+        "latency ms p50",
+        "p99",
+        "CPU ms a frame",
+        "ORB-SLAM3: coverage %, ATE m, CPU",
+    )
+    return "\n".join([_line(names), "|" + "---|" * len(names), *rows]) if rows else None
+
+
+def beside_table(realtime: dict[str, list[dict[str, Any]]]) -> str | None:
+    """Return coverage and ATE beside ORB-SLAM3's."""
+    if not all(realtime.values()):
         return None
-    names = ("sequence", "condition", "seeds", "coverage %", "ATE m", "maps lost", "joined again", "CPU ms a frame")
-    return "\n".join([_line(names), "|" + "---|" * len(names), *rows])
-
-
-def _sequence_row(sequence: str, condition: str, runs: list[dict[str, Any]]) -> str:
-    cells = [
-        sequence,
-        condition,
-        str(len(runs)),
-        _median([100 * run["coverage"] for run in runs], min, 1),
-        _median([run["ate_rmse_m"] for run in runs if run.get("ate_rmse_m") is not None], max, 3),
-        str(sum(run["failures"] for run in runs)),
-        str(sum(run["recoveries"] + run["relocalised"] for run in runs)),
-        _median([run["cpu_ms_per_frame"] for run in runs], max, 0),
+    theirs = (peer.rsplit(", ", 1)[0] for peer in PEER.values())
+    ours = [
+        ", ".join(f"{statistics.median(run[key] for run in runs):.3g}" for key in ("coverage_pct", "ate_rmse_m"))
+        for runs in realtime.values()
     ]
-    return _line(cells)
+    header = _line(("coverage %, ATE m", *PEER))
+    return "\n".join(
+        [header, "|" + "---|" * (len(PEER) + 1), _line(("ORB-SLAM3", *theirs)), _line(("dualslam", *ours))]
+    )
+
+
+QUALITY = ("seeds", "coverage %", "ATE m", "broken stretches", "verdicts")
+
+
+def _read(folder: Path) -> list[dict[str, Any]]:
+    """Return the summaries of a folder's runs, with what `dualslam eval` says of each whose sequence has a truth."""
+    runs = []
+    for summary in sorted(folder.glob("*/summary.json")):
+        run = json.loads(summary.read_text())
+        score = [sys.executable, "-m", "dualslam.cli", "eval", summary.parent, run["source"], "--json"]
+        done = subprocess.run([*map(str, score)], check=False, cwd=ROOT, capture_output=True, text=True)
+        runs.append({**run, **(json.loads(done.stdout) if done.returncode == 0 else {})})
+    return runs
+
+
+def _quality(runs: list[dict[str, Any]]) -> tuple[str, ...]:
+    scored = [run for run in runs if run.get("broken") is not None]
+    broken = ", ".join(f"{run['broken']} of {run['judged']}" for run in scored) or "-"
+    verdicts = Counter(run["verdict"]["level"] for run in runs)
+    said = ", ".join(level if len(runs) == 1 else f"{n} {level}" for level, n in verdicts.items())
+    coverage = _median([100 * run["coverage"] for run in runs], min, 1)
+    ate = _median([run["ate_rmse_m"] for run in scored], max, 4)
+    return str(len(runs)), coverage, ate, broken, said
 
 
 def failures_tables(out: Path) -> str | None:
@@ -210,7 +311,11 @@ def links_table(out: Path) -> str | None:
 
 
 def _median(values: list[float], worst: Any, digits: int) -> str:
-    return f"{statistics.median(values):.{digits}f} ({worst(values):.{digits}f})" if values else "-"
+    """Return the median, and the worst in brackets where there are several."""
+    if not values:
+        return "-"
+    middle = f"{statistics.median(values):.{digits}f}"
+    return middle if len(values) == 1 else f"{middle} ({worst(values):.{digits}f})"
 
 
 def _line(cells: Any) -> str:
