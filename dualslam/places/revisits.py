@@ -158,12 +158,14 @@ class Revisits:
     def join_rest(self, own: Collection[int], now: FrameStamp) -> None:
         """Join sets of submaps that are apart when the run is over, by all places that they share.
 
-        `own`: the submaps of this run; they are compared with all.
+        `own`: the submaps of this run. Those of the largest set are not compared, but all others with them.
         """
-        if not (self._merges and self._is_enabled) or len(self._record.atlas.components()) < 2:
+        atlas = self._record.atlas
+        if not (self._merges and self._is_enabled) or len(atlas.components()) < 2:
             return
         self.take_in(None)
-        joins = SetJoins(self._record, self._parts, own, now)
+        largest = max(atlas.components(), key=lambda ids: sum(len(atlas.submaps[m].keyframes) for m in ids))
+        joins = SetJoins(self._record, self._parts, [m for m in own if m not in largest], now)
         while (found := joins.next()) is not None:
             link = self._link_of(found.match)
             report = self._connections.connect([link], now)

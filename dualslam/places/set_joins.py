@@ -95,15 +95,19 @@ class SetJoins:
                 return a not in joined and abs(arrived[k] - arrived[q]) > RECENT
 
             mapped = submap.keyframes[q].features.take(np.flatnonzero(submap.landmark_of[q] >= 0))
-            results = [
-                (c, parts.verifier.verify((submap, q), (atlas.submaps[c.submap_id], c.keyframe_id)))
-                for c in parts.recogniser.query(mapped, atlas.submaps, may_be)
-            ]
-            yield from (result for _, result in results if not isinstance(result, Failure))
-            for candidate, result in results:
-                if isinstance(result, Failure) and result.reason not in SILENT:
-                    record_refusal(self._record, self._now, m, candidate.submap_id, candidate.keyframe_id, result)
-                    break  # the best of them: one event for a keyframe
+            compared: set[tuple[int, ...]] = set()  # sets: the best candidate of each that is one speaks for it
+            for c in parts.recogniser.query(mapped, atlas.submaps, may_be):
+                other = tuple(atlas.component_of(c.submap_id))
+                if other in compared:
+                    continue
+                result = parts.verifier.verify((submap, q), (atlas.submaps[c.submap_id], c.keyframe_id))
+                if not isinstance(result, Failure):
+                    yield result
+                elif result.reason in SILENT:
+                    continue
+                else:
+                    record_refusal(self._record, self._now, m, c.submap_id, c.keyframe_id, result)
+                compared.add(other)
 
     def _best(self) -> SetJoin | None:
         groups: dict[tuple[int, int], list[_Shared]] = defaultdict(list)
