@@ -194,7 +194,7 @@ def sequences_table(out: Path) -> str | None:
     rows = []
     for folder in sorted((out / "sequences").glob("*/*"), key=lambda path: (path.parent.name, path.name)):
         if runs := _read(folder):
-            joined = sum(run["recoveries"] + run["relocalised"] for run in runs)
+            joined = sum(run["recoveries"] + run["relocalised"] + run["merges"] for run in runs)
             lost = str(sum(run["failures"] for run in runs))
             cells = (
                 folder.parent.name,
@@ -256,14 +256,16 @@ QUALITY = ("seeds", "coverage %", "ATE m", "broken stretches", "verdicts")
 
 
 def _read(folder: Path) -> list[dict[str, Any]]:
-    """Return the summaries of a folder's runs, with what `dualslam eval` says of each whose sequence has a truth."""
-    runs = []
-    for summary in sorted(folder.glob("*/summary.json")):
-        run = json.loads(summary.read_text())
-        score = [sys.executable, "-m", "dualslam.cli", "eval", summary.parent, run["source"], "--json"]
-        done = subprocess.run([*map(str, score)], check=False, cwd=ROOT, capture_output=True, text=True)
-        runs.append({**run, **(json.loads(done.stdout) if done.returncode == 0 else {})})
-    return runs
+    """Return the summaries of a folder's runs, each with its score."""
+    runs = [(path.parent, json.loads(path.read_text())) for path in sorted(folder.glob("*/summary.json"))]
+    return [{**summary, **score_of(run, summary["source"])} for run, summary in runs]
+
+
+def score_of(run: Path, source: str) -> dict[str, Any]:
+    """Return what `dualslam eval` says of a run; nothing of one whose sequence has no ground truth."""
+    command = [sys.executable, "-m", "dualslam.cli", "eval", str(run), source, "--json"]
+    done = subprocess.run(command, check=False, cwd=ROOT, capture_output=True, text=True)
+    return dict(json.loads(done.stdout)) if done.returncode == 0 else {}
 
 
 def _quality(runs: list[dict[str, Any]]) -> tuple[str, ...]:
@@ -272,7 +274,7 @@ def _quality(runs: list[dict[str, Any]]) -> tuple[str, ...]:
     verdicts = Counter(run["verdict"]["level"] for run in runs)
     said = ", ".join(level if len(runs) == 1 else f"{n} {level}" for level, n in verdicts.items())
     coverage = _median([100 * run["coverage"] for run in runs], min, 1)
-    ate = _median([run["ate_rmse_m"] for run in scored], max, 4)
+    ate = _median([run["ate_rmse_m"] for run in runs if run.get("ate_rmse_m") is not None], max, 4)
     return str(len(runs)), coverage, ate, broken, said
 
 

@@ -11,9 +11,21 @@ from types import ModuleType
 import pytest
 
 ROOT = Path(__file__).parents[3]
-SUMMARY = {"coverage": 0.987, "ate_rmse_m": 0.125, "failures": 2, "recoveries": 1, "relocalised": 0}
-SUMMARY["cpu_ms_per_frame"] = 30
-ROW = "| walk | as it is | 1 | 98.7 (98.7) | 0.125 (0.125) | 2 | 1 | 30 (30) |"
+SUMMARY = {
+    "source": "/data/walk",
+    "frames": 100,
+    "coverage": 0.987,
+    "verdict": {"level": "usable"},
+    "failures": 2,
+    "recoveries": 1,
+    "relocalised": 0,
+    "merges": 1,
+    "dropped": 3,
+    "latency_ms": {"median": 20, "p99": 40},
+    "cpu_ms_per_frame": 30,
+}
+SCORE = {"coverage_pct": 98.7, "ate_rmse_m": 0.125, "broken": 1, "judged": 9}
+ROW = "| walk | as it is | 1 | 98.7 | 0.1250 | 1 of 9 | usable | 2 | 2 | 30 |"
 ROWS = (
     "| data: road | base | 15 | 16 | 93.8 |\n| data: road | Dual | 1 | 16 | 6.2 |\n| data: road | Dual+ | 3 | 16 | 19 |"
 )
@@ -32,12 +44,16 @@ def results(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     for page in ("README.md", "docs/index.md", "docs/results.md"):
         shutil.copy(ROOT / page, tmp_path / "pages" / page)
     monkeypatch.setattr(module, "ROOT", tmp_path / "pages")
+    monkeypatch.setattr(module, "score_of", lambda _run, _source: SCORE)
     return module
 
 
 def measured_sequence(results: ModuleType, out: Path, commit: str) -> None:
     results.begin(out, "sequences", commit)
-    run = out / "sequences" / "walk" / "as it is" / "100"
+    ended(out / "sequences" / "walk" / "as it is" / "100")
+
+
+def ended(run: Path) -> None:
     run.mkdir(parents=True)
     (run / "summary.json").write_text(json.dumps(SUMMARY))
 
@@ -64,6 +80,22 @@ def test_each_table_names_the_commit_that_it_was_measured_at(results: ModuleType
     assert ROWS in part_of(page, "failures")
     assert "not asked for" not in part_of(page, "failures")
     assert part_of(page, "links") == links  # what was not measured stands as it was
+
+
+def test_runs_at_the_cameras_rate_stand_beside_those_of_another_system(results: ModuleType, tmp_path: Path) -> None:
+    results.begin(tmp_path, "realtime", "cccc")
+    for name in results.PEER:
+        for seed in ("100", "101"):
+            ended(tmp_path / "realtime" / name / seed)
+    results.write(tmp_path)
+    table = part_of(results.ROOT / "docs" / "results.md", "realtime")
+    scores = "2 | 98.7 (98.7) | 0.1250 (0.1250) | 1 of 9, 1 of 9 | 2 usable | 3.0 (3.0) | 20 (20) | 40 (40) | 30 (30)"
+    assert f"| kitti_03 | {scores} | 99.9, 0.81, 95 |" in table
+    for page in ("README.md", "docs/index.md"):
+        short = part_of(results.ROOT / page, "realtime beside ORB-SLAM3")
+        assert short.startswith("Commit `cccc`, `make results`.\n")
+        assert "\n| ORB-SLAM3 | 99.9, 0.81 |" in short
+        assert "\n| dualslam | 98.7, 0.125 |" in short
 
 
 def test_a_part_is_not_continued_at_another_commit(results: ModuleType, tmp_path: Path) -> None:
