@@ -36,7 +36,7 @@ second keeps frames of a flat scene from counting."""
 LOG_ZOOMS = tuple(round(0.1 * step, 1) for step in range(-7, 8))
 """Factors on the focal length, from a half to two. Near the true one, frames match most points of the map. Far from it
 they match those that fit the wrong focal length, and these say that little is wrong."""
-FAR_ZOOM = 0.5
+FAR_ZOOM = 0.3
 """Log factor beyond which frames of the map may not be found at all by the wrong focal length."""
 N_TRIES = 6
 """Refinements of the best factor, to within its sigma: each takes a part of what is left."""
