@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -68,7 +68,9 @@ class SetJoins:
         """Compare the submaps `asked` with those of other sets."""
         self._record, self._now = record, now
         submaps = record.atlas.submaps
-        matches = (match for m in asked for match in self._matches(m, parts))
+        arrived = {k: n for n, k in enumerate(sorted({k for s in submaps.values() for k in s.keyframes}))}
+        set_of = self._set_of()
+        matches = (match for m in asked for match in self._matches(m, parts, arrived, set_of))
         self._found = [(match, then) for match in matches if (then := poses_of(match, submaps)) is not None]
 
     def next(self) -> SetJoin | None:
@@ -84,20 +86,28 @@ class SetJoins:
 
     # --- steps
 
-    def _matches(self, m: int, parts: PlaceParts) -> Iterator[PlaceMatch]:
-        """Yield the verified places that a submap's keyframes show in other sets."""
+    def _set_of(self) -> dict[int, list[int]]:
+        """Return the linked set of each submap; submaps of one set have the same list."""
+        return {m: component for component in self._record.atlas.components() for m in component}
+
+    def _matches(
+        self, m: int, parts: PlaceParts, arrived: Mapping[int, int], set_of: Mapping[int, list[int]]
+    ) -> Iterator[PlaceMatch]:
+        """Yield the verified places that a submap's keyframes show in other sets.
+
+        `arrived`: the order in which all keyframes came. `set_of`: by submap.
+        """
         atlas = self._record.atlas
-        submap, joined = atlas.submaps[m], set(atlas.component_of(m))
-        arrived = {k: n for n, k in enumerate(sorted({k for s in atlas.submaps.values() for k in s.keyframes}))}
+        submap = atlas.submaps[m]
         for q in sorted(submap.keyframes.keys() - submap.condemned):
 
             def may_be(a: int, k: int, q: int = q) -> bool:
-                return a not in joined and abs(arrived[k] - arrived[q]) > RECENT
+                return set_of[a] is not set_of[m] and abs(arrived[k] - arrived[q]) > RECENT
 
             mapped = submap.keyframes[q].features.take(np.flatnonzero(submap.landmark_of[q] >= 0))
-            compared: set[tuple[int, ...]] = set()  # sets: the best candidate of each that is one speaks for it
+            compared: set[int] = set()  # first submaps of sets: the best candidate of each that is one speaks for it
             for c in parts.recogniser.query(mapped, atlas.submaps, may_be):
-                other = tuple(atlas.component_of(c.submap_id))
+                other = set_of[c.submap_id][0]
                 if other in compared:
                     continue
                 result = parts.verifier.verify((submap, q), (atlas.submaps[c.submap_id], c.keyframe_id))
@@ -119,8 +129,8 @@ class SetJoins:
     def _shared(self) -> Iterator[tuple[tuple[int, int], _Shared]]:
         """Yield the places that sets which are still apart share, each with the first submaps of the two."""
         atlas = self._record.atlas
-        set_of = {m: component for component in atlas.components() for m in component}
-        worlds = {component[0]: atlas.S_world_submap(component) for component in set_of.values()}
+        set_of = self._set_of()
+        worlds = {component[0]: atlas.S_world_submap(component) for component in atlas.components()}
         for found, then in self._found:
             match = follow_maps(found, then, atlas.submaps)
             if match is None or set_of[match.place[0]] is set_of[match.query[0]]:

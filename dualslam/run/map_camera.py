@@ -80,9 +80,10 @@ def camera_that_fits(config: Config, frames: Iterable[Frame], camera: Camera, sa
         return tried, _frames_in_map(config, frames, tried, load_atlas(saved_map))
 
     zooms = [log_zoom for log_zoom in LOG_ZOOMS if as_given is not None or abs(log_zoom) >= FAR_ZOOM]
-    zoom = max(zooms, key=lambda log_zoom: sum(len(s.xyz) for s in seen_with(log_zoom)[1]))
+    tries = {log_zoom: seen_with(log_zoom) for log_zoom in zooms}
+    zoom = max(zooms, key=lambda log_zoom: sum(len(s.xyz) for s in tries[log_zoom][1]))
     for _ in range(N_TRIES):
-        tried, seen = seen_with(zoom)
+        tried, seen = tries[zoom] if zoom in tries else seen_with(zoom)
         found = log_focal_of(seen)
         if found is None or abs(found[0]) <= found[1]:
             break
