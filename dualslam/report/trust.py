@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from dualslam.core.noise_model import UNSURE_SCALE
 from dualslam.core.types import FloatArray
 from dualslam.report.markup import Markup, cards, coordinate, join, number, stretched, tag
 from dualslam.report.run_data import RunData
@@ -36,9 +37,9 @@ def trust_section(run: RunData) -> Markup:
         _strip(
             run,
             [row.sigma_scale for row in run.rows],
-            "sigma of the scale across a frame",
-            "Above it the scale may have changed unseen.",
-            run.config.get("linking", {}).get("wrong_scale"),
+            "sigma of the scale at a frame, against that of its submap",
+            "Above it what lies there may be 15 % too large or too small.",
+            UNSURE_SCALE,
         ),
         _strip(
             run,
@@ -81,7 +82,7 @@ def _strip(run: RunData, sigmas: list[float | None], name: str, note: str, thres
         if (worst := _worst(part)) is not None:
             share = 1.0 if np.isinf(worst) else float((np.log10(worst) - low) / (high - low))
             frames = f"frames {run.rows[first].index} to {run.rows[first + len(part) - 1].index}"
-            title = tag("title", f"{frames}: {'not handed on' if np.isinf(worst) else number(worst, 2)}")
+            title = tag("title", f"{frames}: {'not known' if np.isinf(worst) else number(worst, 2)}")
             share = max(share, 0.01)
             bars.append(tag("rect", title, x=float(i), y=100 * (1 - share), width=0.9, height=100 * share, cls="bar"))
         first += len(part)

@@ -6,7 +6,7 @@ or posed again later. A frame claims what the keyframe does that it hangs on.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -14,14 +14,11 @@ from dualslam.core.geometry import se3
 from dualslam.core.noise_model import GROUP
 from dualslam.core.types import FloatArray
 from dualslam.linking.gates import PIXEL_CHI2
-from dualslam.linking.scale_observability import scale_sigmas_between
+from dualslam.linking.scale_observability import answer_scale, ask_scale
 from dualslam.map.landmark_views import landmark_covariances, noise_excess, resection_covariance
 from dualslam.map.submap import Submap
 from dualslam.recovery.scale_watch import SCALE_INFLATION
 
-TOGETHER = 2
-"""Groups that are asked of one set of normal equations, which takes little longer than for one. With more the sigmas
-sink, by a quarter with 6 (a room), since more of the map holds the scale: the inflation below is not made for that."""
 POSITION_INFLATION = 1.1
 """As `SCALE_INFLATION` (`recovery/scale_watch.py`), for positions."""
 NEAR = 2
@@ -36,8 +33,8 @@ class Claim:
     sigma_position_rel: float
     """Standard deviation of the position against what the keyframe sees, over the median depth of that."""
     sigma_scale: float
-    """Standard deviation of the logarithm of the scale after the keyframe against that before it: how firmly the scale
-    is handed on across it. Infinite where it is not."""
+    """Standard deviation of the logarithm of the scale at the keyframe against that of its whole submap: by how much
+    what lies there may be too large or too small. Infinite where nothing ties it to the rest."""
 
 
 def claims_of(submap: Submap) -> dict[int, Claim]:
@@ -67,20 +64,18 @@ def _position_sigma(submap: Submap, keyframe_id: int, covariances: FloatArray) -
 
 
 def _scale_sigmas(submap: Submap, excess: dict[int, float]) -> dict[int, float]:
-    """Ask, for each group of keyframes, how well those before and those after it hold one scale.
+    """Ask for each group of keyframes how well its scale is known against that of the whole map.
 
-    The noisiest of them says how much less well: the scale goes through all of them.
+    Each observation is as noisy as its keyframe's residuals say.
     """
     ids = np.array(sorted(submap.keyframes), np.int64)
     groups = [ids[begin : begin + GROUP] for begin in range(0, len(ids), GROUP)]
-    sigma_of: dict[int, float] = {}
-    for begin in range(0, len(groups), TOGETHER):
-        asked = range(begin, min(begin + TOGETHER, len(groups)))
-        # At either end of the map the group itself stands for those that are missing.
-        around = [(groups[max(g - 1, 0)], groups[min(g + 1, len(groups) - 1)]) for g in asked]
-        for g, sigma in zip(asked, scale_sigmas_between(submap, around, PIXEL_CHI2), strict=True):
-            through = np.concatenate(groups[max(g - 1, 0) : g + 2]).tolist()
-            inflation = SCALE_INFLATION * max(excess[k] for k in through)
-            sigma_of |= dict.fromkeys(groups[g].tolist(), inflation * sigma)
+    question = ask_scale(submap, [(group, ids) for group in groups], PIXEL_CHI2, n_around=0)
+    noise = np.array([excess[k] for k in question.ids.tolist()])[question.kf]
+    sigmas = answer_scale(replace(question, sigma_px=noise * question.sigma_px))
     can_tell = len(groups) > 1 and bool(submap.landmarks["alive"].any())
-    return sigma_of if can_tell else dict.fromkeys(sigma_of, float("nan"))
+    return {
+        k: SCALE_INFLATION * sigma if can_tell else float("nan")
+        for group, sigma in zip(groups, sigmas, strict=True)
+        for k in group.tolist()
+    }

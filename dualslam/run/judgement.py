@@ -10,6 +10,7 @@ import numpy as np
 from dualslam.core.estimates import MAX_PRIOR_SIGMAS
 from dualslam.core.events import EventKind
 from dualslam.core.geometry import sim3
+from dualslam.core.noise_model import UNSURE_SCALE
 from dualslam.core.trajectory import Trajectory
 from dualslam.core.types import FrameStatus
 from dualslam.map.frame_records import FrameRow
@@ -25,8 +26,6 @@ MIN_JUMP_DEPTHS = 0.02
 """Length of a jump over the median depth of the scene: shorter ones are noise of single frames."""
 MIN_COVERAGE = 0.95
 """Share of the frames that can be posed."""
-MAX_SCALE_SIGMA = 0.5
-"""Of the logarithm of the scale after a keyframe against that before it: as much, or more, is not handed on."""
 MAX_FOCAL_SIGMA = 0.03
 """Standard deviation of the logarithm of the focal length."""
 MIN_FOCAL_CHANGE, MAX_FOCAL_SIGMAS = 0.1, 4.0
@@ -185,15 +184,16 @@ def _photometric(system: System, found: Disagreement) -> list[Reason]:
 
 
 def _scale(rows: Sequence[FrameRow]) -> list[Reason]:
-    lost = [
-        row for row in rows if row.in_main_map and row.sigma_scale is not None and row.sigma_scale > MAX_SCALE_SIGMA
-    ]
-    if not lost:
+    """Return where the scale is unsure, if that is at more frames than may be missing."""
+    known = {row.index: row.sigma_scale for row in rows if row.in_main_map and row.sigma_scale is not None}
+    unsure = sorted(index for index, sigma in known.items() if sigma > UNSURE_SCALE)
+    if len(unsure) <= (1.0 - MIN_COVERAGE) * len(known):
         return []
-    first, last = _longest_run(sorted(row.index for row in lost))
+    first, last = _longest_run(unsure)
     text = (
-        f"The scale is not handed on across frames {first} to {last}: what lies before and after may differ in size. "
-        "Too little is seen on both sides. Move sideways there, or turn more slowly."
+        f"The scale of {len(unsure)} frames, mostly {first} to {last}, is hardly tied to that of the others: "
+        "what lies there may be 15 % too large or too small. "
+        "Too little is seen from both sides. Move sideways there, turn more slowly, or come back to the place."
     )
     return [Reason(ReasonCode.SCALE, Level.USABLE, text, first, last)]
 

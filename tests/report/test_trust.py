@@ -45,7 +45,7 @@ def test_claims_are_drawn_and_what_is_not_handed_on_stands_highest(broken_run: R
     rows = [replace(row, sigma_scale=sigmas[i % 4], sigma_position_rel=0.001) for i, row in enumerate(broken_run.rows)]
     text = str(trust_section(replace(broken_run, rows=rows)))
     bars = re.findall(r"<title>frames[^<]*: ([^<]*)</title>", text)
-    assert "not handed on" in bars
+    assert "not known" in bars
     assert "95 % below 0.02" in text
 
 

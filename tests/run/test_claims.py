@@ -1,4 +1,4 @@
-"""What a map claims of its accuracy stands in proportion to what is true, and says where the scale is not handed on."""
+"""What a map claims of its accuracy stands in proportion to what is true, and says where the scale is not tied."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ def test_where_pixels_fit_worse_less_is_claimed_of_what_lies_about() -> None:
     assert claims[ids[0]].sigma_position_rel == sharp[ids[0]].sigma_position_rel
 
 
-def test_where_nothing_is_seen_on_both_sides_the_scale_is_not_handed_on() -> None:
+def test_where_nothing_is_seen_on_both_sides_the_scale_is_not_known() -> None:
     submap = run()[0].atlas.submaps[0]
     ids = sorted(submap.keyframes)
     at = GROUP

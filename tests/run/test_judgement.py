@@ -186,16 +186,22 @@ def test_a_camera_that_hung_has_not_jumped() -> None:
     assert judged(system).level is Level.GOOD
 
 
-def test_a_scale_that_is_not_handed_on_makes_a_run_usable() -> None:
+@pytest.mark.parametrize(
+    ("sigma", "n_frames", "level"), [(np.inf, 20, "usable"), (0.1, 20, "usable"), (0.1, 8, "good")]
+)
+def test_where_the_scale_of_more_frames_than_may_be_missing_is_unsure_a_run_is_usable(
+    sigma: float, n_frames: int, level: str
+) -> None:
     system = run(ahead())
     trajectories = trajectories_of(system)  # type: ignore[arg-type]
     rows = [
-        replace(row, sigma_scale=float("inf") if 80 <= row.index < 90 else 0.2)
+        replace(row, sigma_scale=sigma if 80 <= row.index < 80 + n_frames else 0.02)
         for row in frame_rows(system)  # type: ignore[arg-type]
     ]
-    (reason,) = judge_run(system, trajectories, rows).reasons  # type: ignore[arg-type]
-    assert (reason.code, reason.level) == (ReasonCode.SCALE, Level.USABLE)
-    assert (reason.first_frame, reason.last_frame) == (80, 89)
+    verdict = judge_run(system, trajectories, rows)  # type: ignore[arg-type]
+    assert verdict.level == Level(level)
+    about = [(reason.code, reason.first_frame, reason.last_frame) for reason in verdict.reasons]
+    assert about == [(ReasonCode.SCALE, 80, 99)] * (level == "usable")
 
 
 @pytest.mark.parametrize(("is_sure", "level"), [(True, Level.GOOD), (False, Level.USABLE)])
