@@ -97,7 +97,8 @@ class ReadoutEstimator:
         evidence = self._chi2[0 if best else TYPICAL] - self._chi2[best]
         self.suspects = best > 0 and evidence > SUSPICION * self._min_evidence
         # A lowest value at the rim of what is tried is no minimum yet.
-        known = evidence > self._min_evidence and best < len(READOUTS_S) - 1
+        known = evidence > self._min_evidence or (self.suspects and self._is_narrow(best))
+        known &= best < len(READOUTS_S) - 1
         self.is_done = known and (
             best == 0 or self._n_pairs >= ENOUGH_PAIRS or self._curvature(best) > ENOUGH_CURVATURE
         )
@@ -111,6 +112,11 @@ class ReadoutEstimator:
         before_s, at_s, after_s = (self._recent[k][0].timestamp_s for k in (n - 1, n, n + 1))
         share = np.clip((at_s - before_s) / (after_s - before_s), 0.0, 1.0) if after_s != before_s else 0.5
         return np.asarray((1 - share) * to_rad_s + share * from_rad_s, np.float64)
+
+    def _is_narrow(self, best: int) -> bool:
+        """Whether all times but the best one and its neighbours are ruled out: a short one hardly differs from none."""
+        others = np.delete(self._chi2, slice(best - 1, best + 2))
+        return bool(others.min() - self._chi2[best] > self._min_evidence)
 
     def _curvature(self, best: int) -> float:
         left, middle, right = self._chi2[best - 1 : best + 2]

@@ -81,6 +81,14 @@ def test_readout_is_found_from_pixels(seed: int) -> None:
     assert all(started[-20:])
 
 
+@pytest.mark.parametrize("seed", first_of([2, 0]))
+def test_a_short_readout_that_is_hardly_told_from_none_keeps_no_map_waiting(seed: int) -> None:
+    """It lies between two of the times that are tried, which fit alike, and all others are ruled out."""
+    shutter, started = asked(PointWorld(cloud(seed=seed), shaken(60), seed=seed), 0.003)
+    assert shutter.readout_s == pytest.approx(0.003, abs=0.001)
+    assert all(started[-20:])
+
+
 @pytest.mark.parametrize("seed", first_of([0, 1]))
 def test_images_turned_upside_down_are_read_from_their_last_row_on(seed: int) -> None:
     world = PointWorld(cloud(seed=seed), shaken(120), seed=seed)
