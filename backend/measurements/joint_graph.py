@@ -8,13 +8,14 @@ non-convexity (truncated least squares) decides which readings and which doubtfu
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby
 from typing import Self
 
 import gtsam
 import numpy as np
+from scipy.linalg import solve_triangular
 
 from dualslam.backend import convert
 from dualslam.backend.atlas_solver import LEAST_SIGMAS
@@ -22,6 +23,7 @@ from dualslam.backend.measurements.exports import export_graph
 from dualslam.backend.measurements.path import CameraPath, Term, attach
 from dualslam.backend.measurements.start import MAX_OFFSET_S, POSITION, QUANTILE_99, MetricStart, find_start, up_of
 from dualslam.backend.noise import gaussian
+from dualslam.backend.solver import GTSAM_ERRORS
 from dualslam.core.chi_square import CHI2_99, CHI2_999, MEDIAN_CHI2
 from dualslam.core.errors import InputError
 from dualslam.core.geometry import sim3, so3
@@ -203,10 +205,10 @@ class JointGraph:
 
         An offset that is estimated in vain costs accuracy along the way: 0.07 s are 0.7 m at 10 m/s.
         """
-        marginals = gtsam.Marginals(graph, self.values)
+        covariance = self._covariances(graph)
         n = len(self._clock)
         for source, key in list(self._clock.items()):
-            sigma = float(np.sqrt(marginals.marginalCovariance(key)[0, 0]))
+            sigma = float(np.sqrt(covariance(key)[0, 0]))
             if abs(self.offsets_s[source] + float(self.values.atVector(key)[0])) < np.sqrt(CHI2_99[1]) * sigma:
                 self.values.erase(self._clock.pop(source))
                 self._right_clocks[source] = -self.offsets_s[source]
@@ -380,10 +382,26 @@ class JointGraph:
         dof = max(sum(len(t.reading.sigmas) for t in self.terms if _counts(t)) - 7, 1)
         return float((2.0 * graph.error(self.values) - dof) / np.sqrt(2.0 * dof))
 
+    def _covariances(self, graph: gtsam.NonlinearFactorGraph) -> Callable[[int], FloatArray]:
+        """Return a function that gives the covariance of a key.
+
+        GTSAM squares the problem. Where no reading holds the gauge that takes half of the digits too many.
+        """
+        try:
+            marginals = gtsam.Marginals(graph, self.values)
+            return lambda key: np.asarray(marginals.marginalCovariance(key))
+        except GTSAM_ERRORS:
+            A, _ = graph.linearize(self.values).jacobian()  # its columns are in the order of the keys
+        root = solve_triangular(np.linalg.qr(A, mode="r"), np.eye(A.shape[1]))
+        keys, n = sorted(self.values.keys()), len(self.problem.S_world_node)
+        ends = np.cumsum([7 if key < n else len(self.values.atVector(key)) for key in keys])
+        rows = dict(zip(keys, np.split(root, ends[:-1]), strict=True))
+        return lambda key: np.asarray(rows[key] @ rows[key].T)
+
     def _solution(self, graph: gtsam.NonlinearFactorGraph, excess: float) -> MetricSolution:
-        marginals = gtsam.Marginals(graph, self.values)
+        covariance = self._covariances(graph)
         nodes = range(len(self.problem.S_world_node))
-        C = np.array([marginals.marginalCovariance(n) for n in nodes]).reshape(-1, 7, 7)
+        C = np.array([covariance(n) for n in nodes]).reshape(-1, 7, 7)
         S = np.array([convert.from_similarity3(self.values.atSimilarity3(n)) for n in nodes])
         count = [t for t in self.terms if _counts(t)]
         whitened: dict[str, list[FloatArray]] = {}
@@ -406,7 +424,7 @@ class JointGraph:
             repeated=self.n_repeated,
             normalised_rms={kind: float(np.sqrt((np.concatenate(r) ** 2).mean())) for kind, r in whitened.items()},
             clock_offset_s={n: self.offsets_s[i] + float(self.values.atVector(k)[0]) for n, (i, k) in clocks.items()},
-            clock_sigma_s={n: float(np.sqrt(marginals.marginalCovariance(k)[0, 0])) for n, (_, k) in clocks.items()},
+            clock_sigma_s={n: float(np.sqrt(covariance(k)[0, 0])) for n, (_, k) in clocks.items()},
             metres_per_unit=per_world,
             scale_sigma=float(np.sqrt(C[middle, 6, 6])),
             rotation_sigma_rad=_largest_sigma(C[middle, :3, :3]),

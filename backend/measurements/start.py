@@ -79,9 +79,14 @@ def _check(source: MeasurementSource, path: CameraPath) -> None:
     reach = MAX_OFFSET_S if source.has_clock else 0.0
     first, last = path.span_s
     if ((times < first - reach) | (times > last + reach)).all():
+        together = first - times.min()
+        advice = f"give --clock-offset SECONDS, which is added to them ({together:.1f} if both began together)"
+        for unit, per_s in (("milliseconds", 1e3), ("microseconds", 1e6), ("nanoseconds", 1e9)):
+            if 0.5 < np.ptp(times) / (per_s * max(last - first, 1e-9)) < 2.0:
+                advice = f"they seem to be in {unit}; write seconds"
         raise InputError(
             f"{source.name}: its times, {times.min():.1f} to {times.max():.1f} s, do not overlap those of the video, "
-            f"{first:.1f} to {last:.1f} s; give --clock-offset SECONDS, which is added to them."
+            f"{first:.1f} to {last:.1f} s; {advice}."
         )
     readings = [r for r in source.readings if r.kind == POSITION]
     p, sigma = np.array([r.xyz_m for r in readings]), np.array([r.sigmas for r in readings])

@@ -283,6 +283,15 @@ def test_a_gyroscope_is_turned_into_place_and_its_bias_found():
     assert rmse(errors_m(problem, solution, moving)) < 1.0
 
 
+def test_a_gyroscope_alone_gives_no_scale_of_a_sure_map():
+    """The map is a million times surer within than the gauge's prior: normal equations have no digits left for both."""
+    truth = drive(300)
+    problem = drifted(truth, drift=1e-3)
+    surer = replace(problem.edges, covariance=1e-6 * problem.edges.covariance)
+    solution = solve(replace(problem, edges=surer), Gyroscope(seed=2).rates(truth))
+    assert solution.scale_sigma > 0.9
+
+
 def test_integration_knows_the_bias():
     truth = drive()
     readings = readings_of(Gyroscope(0.001, (0.02, 0.01, -0.03)).rates(truth)).readings

@@ -65,16 +65,20 @@ def test_subtitles_of_both_kinds(tmp_path):
     rows = read_measurements(path, sigma=2.0).rows
     assert [row.values[0] for row in rows] == [1.5, 2.5]
     assert rows[1].values[2] == pytest.approx(1112, abs=3)
-    path.write_text(block.format(n=1, text="GPS(11.6,48.1,520)"))
-    assert read_measurements(path, sigma=2.0).origin == ORIGIN
+    for text in ("GPS(11.6,48.1,520)", "GPS (11.6, 48.1, 14), D 2.1m, H 520.0m", "GPS(11.6,48.1,14) BAROMETER:520.0"):
+        path.write_text(block.format(n=1, text=text))
+        assert read_measurements(path, sigma=2.0).origin == ORIGIN
 
 
 def test_exif_positions_have_the_images_times(tmp_path):
+    (tmp_path / "images").mkdir()
     for i, minutes in enumerate((6.0, 6.1)):
         exif = Image.Exif()
         exif.get_ifd(0x8825).update({1: "S", 2: (48.0, minutes, 0.0), 3: "E", 4: (11.0, 36.0, 0.0), 6: 520.0})
-        Image.new("L", (8, 8)).save(tmp_path / f"{i}.jpg", exif=exif)
+        Image.new("L", (8, 8)).save(tmp_path / "images" / f"{i}.jpg", exif=exif)
     source = read_measurements(tmp_path, 3.0, frame_times_s=np.array([0.0, 0.5]))
+    within = read_measurements(tmp_path / "images", 3.0, frame_times_s=np.array([0.0, 0.5]))
+    assert [row.values for row in within.rows] == [row.values for row in source.rows]
     assert source.has_clock is False
     assert source.origin == (-48.1, 11.6, 520.0)
     assert source.rows[1].values[0] == 0.5

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -90,3 +92,6 @@ def test_files_are_read_with_one_origin_and_named_in_errors(world: DriftingMap, 
     (late,) = read_rows([path], None, 1000.0, None)
     with pytest.raises(InputError, match=r"gps\.csv: its times.*do not overlap"):
         measured_of(world, late)
+    in_ms = RowSource("ms", [replace(r, values=(1e3 * r.values[0], *r.values[1:])) for r in positions(world).rows])
+    with pytest.raises(InputError, match="seem to be in milliseconds"):
+        measured_of(world, replace(in_ms, rows=[r for r in in_ms.rows if r.values[0] > 20.0]))

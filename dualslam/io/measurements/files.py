@@ -36,8 +36,10 @@ N_TIMES = {"mount": 0, "relative_pose": 2, "distance": 2, "same_place": 2}
 """Leading values that are times; one in other kinds."""
 _CUE = re.compile(r"(\d+):(\d+):(\d+)[,.](\d+)\s*-->")
 _NUMBER = r"\s*[:=]?\s*([-+]?\d+\.?\d*)"
-_LLH = [re.compile(name + _NUMBER, re.I) for name in ("latitude", r"long(?:i)?tude", "(?:abs_alt|altitude)")]
+_LLH = [re.compile(name + _NUMBER, re.I) for name in ("latitude", r"long(?:i)?tude", "(?:abs_alt|altitude|barometer)")]
 _GPS_TRIPLE = re.compile(r"GPS\s*\(\s*([-+\d.]+)\s*,\s*([-+\d.]+)\s*,\s*([-+\d.]+)")
+_ABOVE_START = re.compile(r"\bH\s+([-+]?\d+\.?\d*)\s*m")
+"""Of subtitles in which the third number of a triple may be the count of satellites."""
 
 Rows = list[MeasurementRow]
 
@@ -185,7 +187,9 @@ def _srt(path: Path, text: str, sigma: float | None) -> Rows:
             continue
         llh = [float(each.group(1)) if each else 0.0 for each in found]
         if triple is not None:  # older ones write longitude first
+            height = found[2] or _ABOVE_START.search(block)
             llh = [float(triple.group(i)) for i in (2, 1, 3)]
+            llh[2] = float(height.group(1)) if height else llh[2]
         if llh[0] or llh[1]:  # otherwise there is no fix yet
             h, m, s, ms = cue.groups()
             rows.append(fix_row(path, 3600 * int(h) + 60 * int(m) + int(s) + float(f"0.{ms}"), llh, sigma))
@@ -196,7 +200,7 @@ def _srt(path: Path, text: str, sigma: float | None) -> Rows:
 
 def _exif(path: Path, sigma: float | None, times_s: FloatArray | None) -> Rows:
     """Return the positions in the data of images, at the images' own times."""
-    images = list_images(path)
+    images = list_images(path / "images" if (path / "images").is_dir() else path)
     if times_s is None or len(times_s) != len(images):
         n = "unknown" if times_s is None else len(times_s)
         raise InputError(f"{path} has {len(images)} images, the source {n}: EXIF positions belong to the source's own.")
