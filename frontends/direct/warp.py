@@ -6,14 +6,17 @@ The warp is affine within a patch. All patches of a view are warped at once.
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from dualslam.core.camera.base import Camera, plane
-from dualslam.core.types import BoolArray, FloatArray
+from dualslam.core.types import BoolArray, FloatArray, IntArray
 
 Pyramid = list[NDArray[np.float32]]
 
@@ -97,28 +100,42 @@ def sample(levels: Pyramid, uv_px: FloatArray, axes: FloatArray, half: int) -> N
     - `levels` (list of (H, W)), `uv_px` (N, 2).
     - `axes` (N, 2, 2): columns: steps in the image from one pixel of the patch to its right and lower neighbour.
     """
+    return sample_each([levels], np.zeros(len(uv_px), np.int64), uv_px, axes, half)
+
+
+def sample_each(
+    images: Sequence[Pyramid], image_of: IntArray, uv_px: FloatArray, axes: FloatArray, half: int
+) -> NDArray[np.float32]:
+    """Return patches (N, S, S) as `sample` does, each of its own image: `image_of` (N,)."""
     step = np.sqrt(np.abs(np.linalg.det(axes)))
-    side = 2 * half + 1
-    level = np.clip(np.rint(np.log2(np.maximum(step, 1e-6))), 0, len(levels) - 1).astype(np.int64)
-    grid = np.arange(-half, half + 1, dtype=np.float64)
-    patches = np.zeros((len(uv_px), side, side), np.float32)
-    for n in np.unique(level).tolist():
-        of_level = np.flatnonzero(level == n)
-        for begin in range(0, len(of_level), REMAP_ROWS // side):
-            rows = of_level[begin : begin + REMAP_ROWS // side]
-            # The middle of a level's first pixel is the middle of the image's.
-            right, down = axes[rows].transpose(2, 1, 0)[..., None, None] / 2.0**n
-            at = np.empty((2, len(rows), side, side), np.float32)
-            np.add(uv_px[rows].T[..., None, None] / 2.0**n + right * grid, down * grid[:, None], out=at)
-            u, v = at.reshape(2, len(rows) * side, side)
-            out = cv2.remap(levels[n], u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-            patches[rows] = out.reshape(len(rows), side, side)
+    highest = np.array([len(levels) - 1 for levels in images])[image_of]
+    level = np.clip(np.rint(np.log2(np.maximum(step, 1e-6))), 0, highest).astype(np.int64)
+    source = MAX_LEVELS * image_of + level
+    order = np.argsort(source, kind="stable")
+    # The middle of a level's first pixel is the middle of the image's.
+    shrunk = 2.0 ** level[order, None]
+    right, down = (axes[order] / shrunk[..., None]).transpose(2, 1, 0)[..., None, None]
+    side, grid = 2 * half + 1, np.arange(-half, half + 1, dtype=np.float64)
+    at = np.empty((2, len(order), side, side), np.float32)
+    np.add((uv_px[order] / shrunk).T[..., None, None] + right * grid, down * grid[:, None], out=at)
+    patches = np.empty((len(order), side, side), np.float32)
+    for begin, end in _runs(source[order], REMAP_ROWS // side):
+        of, n = divmod(int(source[order[begin]]), MAX_LEVELS)
+        u, v = at[:, begin:end].reshape(2, -1, side)
+        out = cv2.remap(images[of][n], u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        patches[order[begin:end]] = out.reshape(-1, side, side)
     return patches
+
+
+def _runs(values: IntArray, longest: int) -> list[tuple[int, int]]:
+    """Return where each run of equal values begins and ends, longer ones in parts."""
+    bounds = [0, *(np.flatnonzero(np.diff(values)) + 1).tolist(), len(values)]
+    return [(k, min(k + longest, end)) for begin, end in pairwise(bounds) for k in range(begin, end, longest)]
 
 
 def correlate(a: NDArray[np.generic], b: NDArray[np.generic]) -> FloatArray:
     """Return the zero-mean normalised cross-correlation (N,) of patches (N, S, S); 0 where one of them is flat."""
-    x, y = (each.reshape(len(each), -1).astype(np.float64) for each in (a, b))
+    x, y = (each.reshape(len(each), math.prod(each.shape[1:])).astype(np.float64) for each in (a, b))
     x, y = x - x.mean(axis=1, keepdims=True), y - y.mean(axis=1, keepdims=True)
     norm = np.sqrt((x * x).sum(axis=1) * (y * y).sum(axis=1))
     return np.asarray((x * y).sum(axis=1) / np.maximum(norm, 1e-9), np.float64)

@@ -7,7 +7,7 @@ and patches that do not look alike tell of a wrong match.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,10 +17,19 @@ from dualslam.core.geometry import se3
 from dualslam.core.noise_model import MAJORITY
 from dualslam.core.types import REFINED_PX, BoolArray, FloatArray, IntArray
 from dualslam.frontends.direct.patches import MIN_CONTRAST
-from dualslam.frontends.direct.warp import HALF, Pyramid, build_pyramid, correlate, inside, sample, warp_points
+from dualslam.frontends.direct.warp import (
+    HALF,
+    Pyramid,
+    build_pyramid,
+    correlate,
+    inside,
+    sample,
+    sample_each,
+    warp_points,
+)
 from dualslam.frontends.tracking.keyframe_images import KeyframeImages
 from dualslam.frontends.tracking.row_shifts import find_as_read
-from dualslam.map.submap import NO_LANDMARK, Submap
+from dualslam.map.submap import Submap
 
 N_ITERATIONS = 4
 MAX_ZOOM = 1.5
@@ -31,6 +40,23 @@ CONVERGED = 0.1
 """Last step in pixels of the patch."""
 AGREES = 0.85
 """Correlation of two patches of the same surface."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Pairs:
+    """M observations, and for each an older one of the same landmark."""
+
+    row: IntArray  # (M,): of the submap's observations
+    kf: IntArray  # (M,)
+    feature: IntArray  # (M,): of the keyframe
+    landmark: IntArray  # (M,)
+    kf_there: IntArray  # (M,): whose patch is the reference
+    feature_there: IntArray  # (M,)
+    depth_there: FloatArray  # (M,)
+
+    def take(self, of: IntArray | BoolArray) -> _Pairs:
+        """Return some of them."""
+        return _Pairs(*(getattr(self, field.name)[of] for field in fields(self)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -69,77 +95,84 @@ class PatchAlignment:
 
     def refine(self, submap: Submap, rows: IntArray) -> None:
         """Move the pixels of observations to where their patches match, and remove those that match nowhere near."""
-        kf = submap.observations["kf"][rows]
         self._pyramids = {k: levels for k, levels in self._pyramids.items() if k in self._images}
         self._patches = {k: patches for k, patches in self._patches.items() if k in self._images}
-        contradicted = [self._refine_in(submap, k, rows[kf == k]) for k in np.unique(kf).tolist() if k in self._images]
-        if contradicted:
-            submap.remove_outliers(np.concatenate(contradicted))
+        pairs = self._pairs(submap, rows)
+        tested, agrees = np.zeros(len(pairs.row), np.bool_), np.zeros(len(pairs.row), np.bool_)
+        for of in _in_turn(pairs):
+            part = pairs.take(of)
+            aligned = self._align_pairs(submap, part)
+            tested[of], agrees[of] = aligned.tested, aligned.agrees
+            self._move(submap, part.take(aligned.agrees), aligned.shift_px[aligned.agrees])
+        kf = pairs.kf
+        most = np.bincount(kf, agrees) > MAJORITY * np.bincount(kf, tested)
+        contradicted = pairs.row[tested & ~agrees & most[kf]]
+        if len(contradicted):
+            submap.remove_outliers(contradicted)
 
-    def _refine_in(self, submap: Submap, k: int, rows: IntArray) -> IntArray:
-        """Refine a keyframe's observations; return the rows that its image contradicts."""
-        ids, feature = (submap.observations[name][rows] for name in ("landmark", "feature"))
-        reference, feature_there = self._references(submap, k, ids)
-        known = np.flatnonzero(reference >= 0)
-        if not len(known):
-            return rows[:0]
-        rows, ids, feature = rows[known], ids[known], feature[known]
-        camera, keyframe = self._camera(), submap.keyframes[k]
-        aligned = self._align_in(submap, k, ids, feature, reference[known], feature_there[known])
-        n_tested, moved = np.count_nonzero(aligned.tested), aligned.agrees
-        features, at = keyframe.features, feature[moved]
-        uv, uv_rect = features.uv_px.copy(), features.uv_rect_px.copy()
-        uv[at] += aligned.shift_px[moved]
-        uv_rect[at] += camera.rectify(uv[at])[0] - camera.rectify(features.uv_px[at])[0]
-        submap.keyframes[k] = replace(keyframe, features=replace(features, uv_px=uv, uv_rect_px=uv_rect))
-        if k in self._patches:
-            self._patches[k].forget(at)
-        wrong = rows[aligned.tested & ~aligned.agrees]
-        return wrong if np.count_nonzero(moved) > MAJORITY * n_tested else wrong[:0]
+    def _move(self, submap: Submap, pairs: _Pairs, shift_px: FloatArray) -> None:
+        """Move features in the images of their keyframes."""
+        camera = self._camera()
+        for k in np.unique(pairs.kf).tolist():
+            of = pairs.kf == k
+            keyframe, at = submap.keyframes[k], pairs.feature[of]
+            features = keyframe.features
+            uv, uv_rect = features.uv_px.copy(), features.uv_rect_px.copy()
+            uv[at] += shift_px[of]
+            uv_rect[at] += camera.rectify(uv[at])[0] - camera.rectify(features.uv_px[at])[0]
+            submap.keyframes[k] = replace(keyframe, features=replace(features, uv_px=uv, uv_rect_px=uv_rect))
+            if k in self._patches:
+                self._patches[k].forget(at)
 
-    def _references(self, submap: Submap, k: int, ids: IntArray) -> tuple[IntArray, IntArray]:
-        """Return the keyframe that each landmark's patch is taken from, or -1, and the feature there.
+    def _pairs(self, submap: Submap, rows: IntArray) -> _Pairs:
+        """Return the observations that have a reference, each with it.
 
-        It is the one that first described the landmark. Where its image is not kept, or shows the landmark in another
-        size, it is the farthest in time.
+        The reference is the observation that first described the landmark. Where its image is not kept, or shows the
+        landmark in another size, it is the farthest in time.
         """
-        reference, feature = np.full(len(ids), -1), np.full(len(ids), -1)
-        first, depth = submap.landmarks["first_kf"][ids], submap.depths(ids, se3.inverse(submap.T_submap_kf[k]))
-        feature_of = np.full(len(submap.landmarks), -1)
-        others = [other for other in submap.keyframes_near(k) if other in self._images and other != k]
-        for other in reversed(others):
-            landmark_of = submap.landmark_of[other]
-            seen = np.flatnonzero(landmark_of != NO_LANDMARK)
-            feature_of[:] = -1
-            feature_of[landmark_of[seen]] = seen
-            zoom = submap.depths(ids, se3.inverse(submap.T_submap_kf[other])) / np.maximum(depth, 1e-9)
-            fits = (feature_of[ids] >= 0) & (zoom < MAX_ZOOM) & (zoom > 1 / MAX_ZOOM) & (first != k)
-            takes = fits & ((reference < 0) | (first == other))
-            reference[takes], feature[takes] = other, feature_of[ids[takes]]
-        return reference, feature
+        obs, first = submap.observations, submap.landmarks["first_kf"]
+        kept = np.array(sorted(k for k in submap.keyframes if k in self._images), np.int64)
+        rows = rows[np.isin(obs["kf"][rows], kept) & (first[obs["landmark"][rows]] != obs["kf"][rows])]
+        others = submap.rows_of_landmarks(obs["landmark"][rows])
+        others = others[np.isin(obs["kf"][others], kept)]
+        at, there = _joined(obs["landmark"][rows], obs["landmark"][others])
+        row, other = rows[at], others[there]
+        landmark, kf, kf_there = obs["landmark"][row], obs["kf"][row], obs["kf"][other]
+        ids, column = np.unique(landmark, return_inverse=True)
+        depths = [submap.depths(ids, se3.inverse(submap.T_submap_kf[k])) for k in kept.tolist()]
+        at_kf = np.searchsorted(kept, (kf, kf_there))
+        depth, depth_there = np.array(depths).reshape(len(kept), len(ids))[at_kf, column]
+        zoom = depth_there / np.maximum(depth, 1e-9)
+        fits = np.flatnonzero((kf_there != kf) & (zoom < MAX_ZOOM) & (zoom > 1 / MAX_ZOOM))
+        is_first = kf_there[fits] == first[landmark[fits]]
+        order = fits[np.lexsort((-kf_there[fits], -np.abs(kf_there - kf)[fits], ~is_first, at[fits]))]
+        best = order[np.unique(at[order], return_index=True)[1]]
+        feature, feature_there = obs["feature"][row[best]], obs["feature"][other[best]]
+        return _Pairs(row[best], kf[best], feature, landmark[best], kf_there[best], feature_there, depth_there[best])
 
-    def _align_in(
-        self, submap: Submap, k: int, ids: IntArray, feature: IntArray, reference: IntArray, feature_there: IntArray
-    ) -> _Aligned:
-        camera, n = self._camera(), len(ids)
+    def _align_pairs(self, submap: Submap, pairs: _Pairs) -> _Aligned:
+        camera, n = self._camera(), len(pairs.row)
         templates = np.zeros((n, 2 * HALF + 3, 2 * HALF + 3), np.float32)
-        uv_there, scale, T_k_there, depth = np.zeros((n, 2)), np.zeros(n), np.zeros((n, 4, 4)), np.zeros(n)
-        T_k_submap = se3.inverse(submap.T_submap_kf[k])
-        for other in np.unique(reference).tolist():
-            of = np.flatnonzero(reference == other)
-            T_submap_other = submap.T_submap_kf[other]
-            uv_there[of] = self._as_read(submap, other, feature_there[of], camera)
-            scale[of] = submap.keyframes[other].features.scale[feature_there[of]]
-            depth[of] = submap.depths(ids[of], se3.inverse(T_submap_other))
-            T_k_there[of] = T_k_submap @ T_submap_other
-            templates[of] = self._templates(other, feature_there[of], uv_there[of], scale[of])
+        uv, uv_there, scale, own_scale = np.zeros((n, 2)), np.zeros((n, 2)), np.zeros(n), np.zeros(n)
+        T_submap_there, T_k_submap = np.zeros((n, 4, 4)), np.zeros((n, 4, 4))
+        for other in np.unique(pairs.kf_there).tolist():
+            of = np.flatnonzero(pairs.kf_there == other)
+            T_submap_there[of], feature = submap.T_submap_kf[other], pairs.feature_there[of]
+            uv_there[of] = self._as_read(submap, other, feature, camera)
+            scale[of] = submap.keyframes[other].features.scale[feature]
+            templates[of] = self._templates(other, feature, uv_there[of], scale[of])
+        keyframes, image_of = np.unique(pairs.kf, return_inverse=True)
+        for k in keyframes.tolist():
+            of = np.flatnonzero(pairs.kf == k)
+            T_k_submap[of] = se3.inverse(submap.T_submap_kf[k])
+            uv[of] = self._as_read(submap, k, pairs.feature[of], camera)
+            own_scale[of] = submap.keyframes[k].features.scale[pairs.feature[of]]
         steps = scale[:, None, None] * np.eye(2)
-        axes = steps @ warp_points(camera, uv_there, depth, T_k_there).J_b_a
-        uv = self._as_read(submap, k, feature, camera)
+        axes = steps @ warp_points(camera, uv_there, pairs.depth_there, T_k_submap @ T_submap_there).J_b_a
         usable = inside(uv_there, steps, HALF + 1, camera.size_px) & np.isfinite(axes).all(axis=(1, 2))
         usable[usable] = inside(uv[usable], axes[usable], HALF, camera.size_px)
-        own_scale = submap.keyframes[k].features.scale[feature]
-        return _align(templates, self._levels(k), uv, axes, usable, REFINED_PX * own_scale)
+        images = [self._levels(k) for k in keyframes.tolist()]
+        return _align(templates, images, image_of, uv, axes, usable, REFINED_PX * own_scale)
 
     def _templates(self, k: int, feature: IntArray, uv_px: FloatArray, scale: FloatArray) -> NDArray[np.float32]:
         """Return patches about features of a keyframe, in their octaves; each is sampled once."""
@@ -165,9 +198,32 @@ class PatchAlignment:
         return self._pyramids[k]
 
 
+def _in_turn(pairs: _Pairs) -> list[IntArray]:
+    """Return which pairs to align at once: as keyframe by keyframe, each against patches that have moved before."""
+    n = 1 + int(max(pairs.feature.max(initial=0), pairs.feature_there.max(initial=0)))
+    at, moves = _joined(pairs.kf_there * n + pairs.feature_there, pairs.kf * n + pairs.feature)
+    first = pairs.kf[moves] < pairs.kf[at]
+    at, moves = at[first], moves[first]
+    turn, later = np.full(len(pairs.kf), -1), np.zeros(len(pairs.kf), np.int64)
+    while not np.array_equal(turn, later):
+        turn = later.copy()
+        later[at] = turn[moves] + 1
+    return [np.flatnonzero(turn == k) for k in range(1 + int(turn.max(initial=-1)))]
+
+
+def _joined(left: IntArray, right: IntArray) -> tuple[IntArray, IntArray]:
+    """Return the positions of all pairs of equal values, by ascending position on the left."""
+    order = np.argsort(right, kind="stable")
+    begin, end = (np.searchsorted(right[order], left, side=side) for side in ("left", "right"))
+    at = np.repeat(np.arange(len(left)), end - begin)
+    within = np.arange(len(at)) - np.repeat(np.cumsum(end - begin) - (end - begin), end - begin)
+    return at, order[begin[at] + within]
+
+
 def _align(
     templates: NDArray[np.float32],
-    levels: Pyramid,
+    images: list[Pyramid],
+    image_of: IntArray,
     uv_px: FloatArray,
     axes: FloatArray,
     usable: BoolArray,
@@ -191,13 +247,15 @@ def _align(
     if len(row):
         to_parameters = np.matmul(np.linalg.inv(H[row]), J[row].swapaxes(1, 2)).astype(np.float32)
         for _ in range(N_ITERATIONS):
-            found = sample(levels, uv_px[row] + shift[row], axes[row], HALF).reshape(len(row), -1, 1)
+            found = sample_each(images, image_of[row], uv_px[row] + shift[row], axes[row], HALF).reshape(
+                len(row), -1, 1
+            )
             du, dv, contrast = np.matmul(to_parameters, found)[:, :, 0].astype(np.float64).T
             d = np.stack([du, dv], axis=1) / np.maximum(contrast, 0.3)[:, None]
             step[row] = np.linalg.norm(d, axis=1)
             d /= np.maximum(step[row], 1.0)[:, None]
             shift[row] -= np.einsum("nij,nj->ni", axes[row], d)
-        found = sample(levels, uv_px[row] + shift[row], axes[row], HALF)
+        found = sample_each(images, image_of[row], uv_px[row] + shift[row], axes[row], HALF)
         agrees[row] = correlate(inner[row].reshape(found.shape), found) > AGREES
     agrees &= (step < CONVERGED) & (np.linalg.norm(shift, axis=1) < max_shift_px)
     return _Aligned(shift, tested, agrees)

@@ -83,3 +83,32 @@ def test_observations_without_an_image_stay_as_they_are() -> None:
     PatchAlignment(KeyframeImages(), lambda: CAMERA).refine(submap, rows_of(submap, 30))
     assert submap.keyframes[30].features is before
     assert (submap.landmark_of[30] >= 0).all()
+
+
+def seen_thrice() -> tuple[Submap, PatchAlignment]:
+    """Return a map whose second keyframe is there twice, with other noise; the first one's image is not kept."""
+    submap, _, _ = seen_twice(noise_px=0.2)
+    second, (_, view, _) = submap.keyframes[30], views()
+    uv = second.features.uv_px + np.random.default_rng(1).normal(0.0, 0.2, second.features.uv_px.shape)
+    third = Keyframe(60, 2.0, replace(second.features, uv_px=uv, uv_rect_px=uv))
+    submap.add_keyframe(third, se3.inverse(T_CAM_KF))
+    row = np.arange(len(uv))
+    submap.add_observations(60, row, row)
+    images = KeyframeImages()
+    for keyframe in (second, third):
+        images.remember(replace(view, index=keyframe.id, features=keyframe.features))
+    return submap, PatchAlignment(images, lambda: CAMERA)
+
+
+def test_keyframes_are_aligned_in_turn() -> None:
+    """The third one's reference is the second, after this has moved."""
+    together, alignment = seen_thrice()
+    alignment.refine(together, np.concatenate([rows_of(together, 60), rows_of(together, 30)]))
+    in_turn, alignment = seen_thrice()
+    for k in (30, 60):
+        alignment.refine(in_turn, rows_of(in_turn, k))
+    before, _ = seen_thrice()
+    for k in (30, 60):
+        uv, expected, was = (each.keyframes[k].features.uv_px for each in (together, in_turn, before))
+        assert (expected != was).any(axis=1).sum() > 60
+        np.testing.assert_array_equal(uv, expected)
