@@ -28,12 +28,14 @@ from dualslam.backend.calibration_bundle import CalibratedOptimum, optimise_with
 from dualslam.backend.observability import compute_depth_sigmas, compute_residuals, take_mask
 from dualslam.core.bundle import BundleProblem
 from dualslam.core.camera.base import Camera
+from dualslam.core.camera.calibrated_size import PRINCIPAL_POINT_SIGMA
 from dualslam.core.camera.corrected import LensCorrection, correction_of, given_camera
 from dualslam.core.chi_square import CHI2_999
 from dualslam.core.config.calibration_config import CalibrationConfig
 from dualslam.core.errors import SolverError
 from dualslam.core.estimates import MAX_PRIOR_SIGMAS, CalibrationEstimate, PreferredCamera
 from dualslam.core.geometry import so3
+from dualslam.core.geometry.umeyama import umeyama
 from dualslam.core.noise_model import INFLATION, PROOF_VIEWS
 from dualslam.core.types import Failure, FailureReason, FloatArray, IntArray
 from dualslam.map.submap import Submap
@@ -42,8 +44,6 @@ MAX_KEYFRAMES = 60
 """Keyframes of the window, neighbours in time; of all such windows the one with most turning."""
 MIN_ROTATION_DEG = 15.0
 """Turning, summed over the window, below which nothing is tried: the focal length could not be known."""
-PRINCIPAL_POINT_SIGMA = 0.015
-"""Prior of the principal point, relative to the image's width: what lenses are off the middle."""
 LENS_SIGMA = 0.03
 """Prior of the radial distortion that is left in the rectified image: the displacement at 45 degrees from the axis (or
 at the image's corner, if that is farther out), relative to the radius."""
@@ -173,6 +173,7 @@ def estimate_correction(
         len(problem.kf),
         time.perf_counter() - start,
         float((np.abs(answer.correction) / answer.prior).max()),
+        _path_change(answer, present) if answer.distance2 > MIN_DISTANCE2 else 0.0,
     )
     sigma = math.sqrt(answer.covariance[0, 0])
     far = abs(float(answer.off[0])) > FAR_SIGMAS * math.sqrt(answer.of_difference[0, 0])
@@ -216,6 +217,20 @@ def _answer(
         return Failure(FailureReason.SOLVER, str(error))
     of_difference = covariance if present_covariance is None else covariance + present_covariance
     return _Answer(best, prior, correction, covariance, correction - present.vector, of_difference)
+
+
+def _path_change(answer: _Answer, present: LensCorrection) -> float:
+    """Return by how much keyframes move with the camera, RMS, over their path; zero where they lie on a line.
+
+    Both maps are solved from the same observations alone: other ties would count as an effect of the camera.
+    """
+    try:
+        now = answer.best.poses_under(present.vector)[:, :3, 3]
+    except (SolverError, np.linalg.LinAlgError):
+        return 0.0
+    path = float(np.linalg.norm(np.diff(now, axis=0), axis=1).sum())
+    aligned = umeyama(answer.best.T_submap_kf[:, :3, 3], now)
+    return 0.0 if isinstance(aligned, Failure) else aligned.rmse / path
 
 
 def _weigh(best: CalibratedOptimum, prior: FloatArray, inflation: float) -> tuple[FloatArray, FloatArray]:

@@ -74,6 +74,9 @@ class CalibrationEstimate:
     seconds : float
     prior_sigmas : float
         The largest part of the correction, in standard deviations of its prior.
+    path_change : float
+        RMS distance by which keyframes would move with the correction, over the length of their path. Zero where the
+        correction may be chance.
     """
 
     correction: LensCorrection
@@ -86,6 +89,7 @@ class CalibrationEstimate:
     n_observations: int
     seconds: float
     prior_sigmas: float = 0.0
+    path_change: float = 0.0
 
     @property
     def numbers(self) -> dict[str, float]:
@@ -102,6 +106,7 @@ class CalibrationEstimate:
             "observations": self.n_observations,
             "seconds": self.seconds,
             "prior_sigmas": self.prior_sigmas,
+            "path_change": self.path_change,
         }
 
 

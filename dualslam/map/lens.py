@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from dualslam.core.camera.base import Camera
-from dualslam.core.camera.corrected import correct
+from dualslam.core.camera.corrected import correct, correction_of
 from dualslam.core.config.calibration_config import CalibrationConfig
 from dualslam.core.errors import InputError, SolverError
 from dualslam.core.estimates import CalibrationEstimate
@@ -32,6 +32,8 @@ AT_LOSS = 1.05
 next one begins with what it says. Lower, single frames without a pose would each cost a question."""
 MIN_AT_END = 10
 """Keyframes of a map that is asked at the end of a run, since it was never old enough, or its question failed."""
+FAR_SIGMAS = 2.0
+"""Standard deviations of the focal length's prior: a correction beyond them is to be confirmed by later keyframes."""
 SURE_SIGMA = 0.01
 """Of the log focal length: an answer that is no surer than this is not the last, however little was known before."""
 
@@ -116,9 +118,14 @@ class Calibration:
         return config.refine and self._refined_in is None and n >= config.first_keyframes and has_grown
 
     def is_due_at_end(self, submap: Submap) -> bool:
-        """Whether to ask a submap as the run ends: where it has not said anything of the camera."""
-        is_open = submap.id not in self._estimated and self._refined_in in (None, submap.id)
-        return self._config.refine and is_open and len(submap.keyframes) >= MIN_AT_END
+        """Whether to ask a submap as the run ends: it has not said anything, or is to confirm a large correction."""
+        n, off = len(submap.keyframes), abs(float(correction_of(self._camera).log_focal))
+        if self._refined_in == submap.id:
+            is_far = off > FAR_SIGMAS * self._config.log_focal_sigma
+            is_open = is_far and n >= AT_LOSS * self._asked_with[submap.id]
+        else:
+            is_open = self._refined_in is None and submap.id not in self._estimated
+        return self._config.refine and is_open and n >= MIN_AT_END
 
     def estimate(self, submap: Submap) -> CalibrationEstimate | Failure:
         """Return what a submap says of the camera; nothing is changed."""

@@ -24,7 +24,7 @@ from dualslam.lab.bench.plan import SourceInfo, Trial
 from dualslam.lab.bench.record import LinkError, TrialOutcome, TrialRecord, blank_record
 from dualslam.lab.bench.run import trial_folder
 from dualslam.lab.bench.spec import SequenceSpec
-from dualslam.lab.bench.truth import compare, read_verdict, submaps_of, true_frames
+from dualslam.lab.bench.truth import are_untrue, compare, read_verdict, submaps_of, true_frames
 from dualslam.map.frame_records import FrameResult
 from dualslam.run.session import Outcome, run_to_folder
 from dualslam.run.sources import SYNTHETIC, open_source
@@ -113,8 +113,9 @@ def _measure(trial: Trial, folder: Path, sequence: Sequence, outcome: Outcome) -
     frames = true_frames(source.source_indices, source.frame_timestamps, truth, corruptions)
     main = outcome.trajectories.main
     on_true_clock, known = frames.on_true_clock(main), frames.truth
-    if len(main) and len(known):
-        ate_m, path_m = trajectory_error(on_true_clock, known, frames.times_s)
+    trusted = known.take(~are_untrue(known.index, trial.truth_breaks))
+    if len(main) and len(trusted):
+        ate_m, path_m = trajectory_error(on_true_clock, trusted, frames.times_s)
         record = replace(record, ate_m=ate_m, path_m=path_m)
     return replace(
         record,

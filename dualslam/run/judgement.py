@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
-from dualslam.core.estimates import MAX_PRIOR_SIGMAS
 from dualslam.core.events import EventKind
 from dualslam.core.geometry import sim3
+from dualslam.core.geometry.umeyama import umeyama
 from dualslam.core.noise_model import UNSURE_SCALE
 from dualslam.core.trajectory import Trajectory
-from dualslam.core.types import FrameStatus
+from dualslam.core.types import Failure, FrameStatus
 from dualslam.map.frame_records import FrameRow
+from dualslam.run.camera_judgement import MAX_PATH_CHANGE, camera_scores, judge_camera
 from dualslam.run.measuring import MANY_REJECTED, Measured
 from dualslam.run.results import Trajectories
 from dualslam.system.audit.photometric import Disagreement, Sample, find_disagreement
@@ -26,16 +26,10 @@ MIN_JUMP_DEPTHS = 0.02
 """Length of a jump over the median depth of the scene: shorter ones are noise of single frames."""
 MIN_COVERAGE = 0.95
 """Share of the frames that can be posed."""
-MAX_FOCAL_SIGMA = 0.03
-"""Standard deviation of the logarithm of the focal length."""
-MIN_FOCAL_CHANGE, MAX_FOCAL_SIGMAS = 0.1, 4.0
-"""Of the logarithm of the focal length against the one that the map was made with until then: two sigmas of what a
-data sheet is off, and known to be more. Its own sigma is that of one submap: of 44 answers on 7-Scenes 1 % are 3.7
-sigmas from their median.
-"""
+MIN_COMPARED = 5
+"""Keyframes by which two maps are compared: a similarity alone fits two of them, and most paths of three."""
 STOOD_S = 1.0
 """For so long at least a camera has stood when it is found to: seven images, a fifth of a second apart, show it."""
-_FOCAL = "log_focal"
 INTERVALS_S = (1e-3, 2.0)
 """Median time between two frames: outside, timestamps are in another unit, or not those of the frames."""
 
@@ -63,17 +57,16 @@ def judge_run(
         reasons.append(_about_all(rows, ReasonCode.CRASHED, Level.USABLE, text))
     if len(trajectories.main):
         steps, found = _steps(system, trajectories), find_disagreement(_held_samples(system, trajectories))
-        told = _camera_answers(system)
         reasons += [*_jumps(system, trajectories, *steps), *_photometric(system, found), *_scale(rows)]
-        reasons += [*_loose_joins(system, trajectories), *_still(system, trajectories), *_camera(system, told, rows)]
+        reasons += [*_loose_joins(system, trajectories), *_still(system, trajectories)]
+        reasons += _replaced(system, trajectories)
+        if (camera := judge_camera(system)) is not None:
+            reasons.append(_about_all(rows, *camera))
         scores = {
             str(ReasonCode.JUMP): float(steps[1].ratio.max(initial=0.0)),
             str(ReasonCode.PHOTOMETRIC): found.worst,
         }
-        if told:
-            scores[str(ReasonCode.CAMERA)] = told[-1].prior_sigmas
-        if system.log_focal_sigma is not None:
-            scores[str(ReasonCode.FOCAL)] = system.log_focal_sigma
+        scores |= camera_scores(system)
     if measured is not None:
         reasons += _measurements(rows, measured)
     return Verdict.of(reasons, scores)
@@ -231,6 +224,30 @@ def _loose_joins(system: System, trajectories: Trajectories) -> list[Reason]:
     return [Reason(ReasonCode.SCALE, Level.USABLE, text, first, last)]
 
 
+def _replaced(system: System, trajectories: Trajectories) -> list[Reason]:
+    """Find frames that a later map has taken from an earlier one whose path it contradicts: one is wrong."""
+    centres = dict(zip(trajectories.main.index.tolist(), trajectories.main.T_world_cam[:, :3, 3], strict=True))
+    for event in system.events.of_kind(EventKind.ABSORBED):
+        for earlier in (system.atlas.submaps[m] for m in event.data["old_submaps"]):
+            index_of = {system.numbers.index_of(k): k for k in sorted(earlier.keyframes)}
+            index = [i for i in index_of if i in centres]
+            if len(index) < MIN_COMPARED:
+                continue
+            was = earlier.keyframe_poses(np.array([index_of[i] for i in index]))[:, :3, 3]
+            now = np.array([centres[i] for i in index])
+            path, aligned = float(np.linalg.norm(np.diff(now, axis=0), axis=1).sum()), umeyama(was, now)
+            noise = MIN_JUMP_DEPTHS * _median_depth(system, trajectories, index[len(index) // 2])
+            if isinstance(aligned, Failure) or aligned.rmse < max(MAX_PATH_CHANGE * path, noise):
+                continue
+            first, last = min(index), max(index)
+            text = (
+                f"Two maps of frames {first} to {last} contradict each other by {100 * aligned.rmse / path:.0f} % of "
+                "the path. The later one was kept. Compare with a run backwards (--reverse)."
+            )
+            return [Reason(ReasonCode.REPLACED, Level.USABLE, text, first, last)]
+    return []
+
+
 def _still(system: System, trajectories: Trajectories) -> list[Reason]:
     """Return where most of the image stood still, as that of a camera at rest, and the map moved the camera."""
     main, numbers = trajectories.main, system.numbers
@@ -250,55 +267,7 @@ def _still(system: System, trajectories: Trajectories) -> list[Reason]:
     return []
 
 
-# --- camera and clock
-
-
-@dataclass(frozen=True, slots=True)
-class _CameraAnswer:
-    """What a map says of its camera: the focal length against the one given, and against the one in use."""
-
-    log_focal: float
-    change: float
-    sigma: float
-    prior_sigmas: float
-
-
-def _camera_answers(system: System) -> list[_CameraAnswer]:
-    """Return the answers that were taken over, and the last one: those before it that were not knew less."""
-    told = [e for e in system.events.of_kind(EventKind.CALIBRATED, EventKind.CALIBRATION_KEPT) if _FOCAL in e.data]
-    answers, in_use = [], 0.0
-    for event in told:
-        data = event.data
-        if event.event is EventKind.CALIBRATED or event is told[-1]:
-            change = data[_FOCAL] - in_use
-            answers.append(_CameraAnswer(data[_FOCAL], change, data["log_focal_sigma"], data["prior_sigmas"]))
-        if event.event is EventKind.CALIBRATED:
-            in_use = data[_FOCAL]
-    return answers
-
-
-def _camera(system: System, told: Sequence[_CameraAnswer], rows: Sequence[FrameRow]) -> list[Reason]:
-    if told:
-        check = "Check that the calibration is of this camera, lens and image size."
-        is_beyond = told[-1].prior_sigmas > MAX_PRIOR_SIGMAS
-        level = Level.DOUBTFUL if is_beyond else Level.USABLE
-        far = [a for a in told if abs(a.change) > MIN_FOCAL_CHANGE + MAX_FOCAL_SIGMAS * a.sigma]
-        if far:
-            apart = far[-1].log_focal
-            share = f"{100 * abs(np.expm1(apart)):.0f} % {'longer' if apart > 0 else 'shorter'}"
-            text = f"The images show a focal length {share} than the calibration says. {check}"
-            return [_about_all(rows, ReasonCode.CAMERA, level, text)]
-        if is_beyond:
-            text = f"The images show another lens than the calibration says: its distortion or its centre. {check}"
-            return [_about_all(rows, ReasonCode.CAMERA, level, text)]
-    sigma = system.log_focal_sigma
-    if sigma is None or sigma < MAX_FOCAL_SIGMA:
-        return []
-    text = (
-        f"The focal length is known to {100 * sigma:.0f} % only. "
-        "Give a calibration with --camera, or record more sideways motion."
-    )
-    return [_about_all(rows, ReasonCode.FOCAL, Level.USABLE, text)]
+# --- clock
 
 
 def _clock(rows: Sequence[FrameRow]) -> list[Reason]:

@@ -21,6 +21,7 @@ from dualslam.core.camera.corrected import LensCorrection, correct
 from dualslam.core.camera.models import PinholeCamera
 from dualslam.core.config.calibration_config import CalibrationConfig
 from dualslam.core.geometry import so3
+from dualslam.core.geometry.umeyama import umeyama
 from dualslam.core.types import Failure, FailureReason, FloatArray, Keyframe
 from dualslam.lab.metrics.alignment import distances_when_aligned
 from dualslam.map.submap import Submap
@@ -76,6 +77,7 @@ class TestEstimate:
         estimate = estimate_calibration(make_submap(TRUE, turning=True), TRUE, CONFIG)
         assert estimate
         assert not estimate.accepted
+        assert estimate.path_change == 0.0
         assert sigmas_off(estimate.correction, np.zeros(5), estimate.covariance).max() < 1.5
 
     @pytest.mark.parametrize("f", [1.03, 0.95])
@@ -88,6 +90,20 @@ class TestEstimate:
         assert sigmas_off(estimate.correction, truth, estimate.covariance).max() < 1.5
         assert abs(estimate.correction.log_focal + np.log(f)) < 0.004
         assert estimate.cost_after < estimate.cost_before
+
+    def test_the_change_of_the_path_is_the_error_that_the_wrong_camera_makes(self) -> None:
+        camera = wrong_camera(1.12)
+        submap = make_submap(camera, turning=True)
+        truth = submap.keyframe_poses(np.arange(len(submap.keyframes)))[:, :3, 3]
+        estimate = estimate_calibration(submap, camera, CONFIG)
+        preferred = find_preferred_camera(submap, np.arange(len(truth)), camera, CONFIG)
+        assert estimate
+        assert preferred is not None
+        error = umeyama(preferred.T_now[:, :3, 3], truth)
+        assert error
+        path = np.linalg.norm(np.diff(truth, axis=0), axis=1).sum()
+        assert estimate.path_change == pytest.approx(error.rmse / path, rel=0.1)
+        assert estimate.path_change > 0.005
 
     @pytest.mark.parametrize(("f", "counts"), [(1.02, False), (1.12, True)])
     def test_an_unsure_answer_counts_only_where_the_given_focal_length_is_far_off(

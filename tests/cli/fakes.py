@@ -9,6 +9,7 @@ import numpy as np
 from dualslam.atlas.atlas import Atlas
 from dualslam.atlas.trajectory import FramePose
 from dualslam.core.camera.base import Camera
+from dualslam.core.camera.models import PinholeCamera
 from dualslam.core.config.settings import Config
 from dualslam.core.events import EventKind, EventLog
 from dualslam.core.jobs import InlineDesk
@@ -63,7 +64,8 @@ class FakeSystem:
         self.n_finished = 0
         self.numbers = FrameNumbers()
         self.audit, self.blank = PhotometricAudit(NoPatches()), set[int]()
-        self.world = self.saved = self.camera = self.log_focal_sigma = self.hidden = None
+        self.world = self.saved = self.log_focal_sigma = self.hidden = None
+        self.camera: Camera = PinholeCamera(640, 480, 500.0, 500.0, 319.5, 239.5)
         self.was_interrupted = False
         self._truth, self._lost, self._before_step = truth, lost, before_step
         self._submap: Submap | None = None

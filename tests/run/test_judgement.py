@@ -9,12 +9,13 @@ import pytest
 
 from dualslam.atlas.atlas import Link, LinkKind
 from dualslam.core.events import EventKind
-from dualslam.core.types import FloatArray, Frame
+from dualslam.core.types import FloatArray, Frame, Keyframe
+from dualslam.map.submap import Submap
 from dualslam.run.judgement import judge_run
 from dualslam.run.results import frame_rows, trajectories_of
 from dualslam.system.audit.photometric import MIN_SAMPLES, Sample
 from dualslam.system.audit.verdict import Level, ReasonCode, Verdict
-from tests.cli.fakes import FakeSystem
+from tests.cli.fakes import NO_FEATURES, FakeSystem
 
 N = 200
 IMAGE = np.zeros((4, 4), np.uint8)
@@ -101,64 +102,10 @@ def test_a_clock_in_another_unit_or_that_repeats_is_told() -> None:
     assert reason.text.startswith(f"1 of {N} timestamps")
 
 
-def test_a_focal_length_that_is_hardly_known_makes_a_run_usable() -> None:
-    system = run(ahead())
-    system.log_focal_sigma = 0.06
-    (reason,) = judged(system).reasons
-    assert (reason.code, reason.level) == (ReasonCode.FOCAL, Level.USABLE)
-
-
 def test_no_pose_is_doubtful() -> None:
     verdict = judged(run(ahead(), lost=tuple(range(N))))
     assert (verdict.level, verdict.reasons[0].code) == (Level.DOUBTFUL, ReasonCode.NO_MAP)
     assert (verdict.reasons[0].first_frame, verdict.reasons[0].last_frame) == (0, N - 1)
-
-
-@pytest.mark.parametrize(("log_focal", "level"), [(0.03, Level.GOOD), (0.41, Level.DOUBTFUL), (-0.2, Level.USABLE)])
-def test_a_focal_length_far_from_the_one_used_is_told(log_focal: float, level: Level) -> None:
-    system = run(ahead())
-    estimates = [{"log_focal": -0.6, "log_focal_sigma": 0.2}, {"log_focal": log_focal, "log_focal_sigma": 0.004}]
-    for frame, estimate in zip((60, 90), estimates, strict=True):
-        far = abs(estimate["log_focal"]) / 0.05
-        system.events.add(
-            EventKind.CALIBRATION_KEPT, frame, frame / 30, 0, reason="too far", prior_sigmas=far, **estimate
-        )
-    system.events.add(EventKind.CALIBRATION_KEPT, 120, 4.0, 0, reason="too little turning")
-    verdict = judged(system)
-    assert verdict.level is level
-    assert [reason.code for reason in verdict.reasons] == [ReasonCode.CAMERA] * (level is not Level.GOOD)
-
-
-@pytest.mark.parametrize(
-    ("answers", "level"),
-    [
-        ([-0.08], Level.GOOD),
-        ([-0.2], Level.USABLE),
-        ([-0.2, -0.21], Level.USABLE),
-        ([-0.08, -0.104], Level.GOOD),  # 7-Scenes, whose calibration is off by as much
-        ([-0.104, -0.109], Level.GOOD),  # not known to be more than a tenth
-    ],
-)
-@pytest.mark.parametrize("last", [EventKind.CALIBRATED, EventKind.CALIBRATION_KEPT])
-def test_what_was_tracked_before_a_large_correction_was_taken_over_may_be_broken(
-    answers: list[float], level: Level, last: EventKind
-) -> None:
-    """What counts is by how much the camera in use was off, not the one that was given."""
-    system = run(ahead())
-    for n, log_focal in enumerate(answers):
-        told = {"log_focal": log_focal, "log_focal_sigma": 0.004, "prior_sigmas": abs(log_focal) / 0.05}
-        kind = last if n == len(answers) - 1 else EventKind.CALIBRATED
-        system.events.add(kind, 60 + 20 * n, 2.0 + n, 0, **told)
-    assert judged(system).level is level
-
-
-def test_another_lens_than_the_one_used_makes_a_run_doubtful() -> None:
-    system = run(ahead())
-    estimate = {"log_focal": 0.03, "log_focal_sigma": 0.007, "k1": -0.27, "k1_sigma": 0.002, "prior_sigmas": 9.0}
-    system.events.add(EventKind.CALIBRATION_KEPT, 60, 2.0, 0, reason="too far", **estimate)
-    verdict = judged(system)
-    assert (verdict.level, verdict.reasons[0].code) == (Level.DOUBTFUL, ReasonCode.CAMERA)
-    assert verdict.scores["camera"] == 9.0
 
 
 @pytest.mark.parametrize(("stood_since", "level"), [(100, Level.DOUBTFUL), (70, Level.GOOD)])
@@ -174,6 +121,25 @@ def test_a_camera_that_moves_in_the_map_alone_makes_a_run_doubtful(stood_since: 
     assert verdict.level is level
     about = [(reason.code, reason.first_frame, reason.last_frame) for reason in verdict.reasons]
     assert about == [(ReasonCode.STILL, 70, 100)] * (level is Level.DOUBTFUL)
+
+
+@pytest.mark.parametrize(("bend", "level"), [(1.0, Level.GOOD), (1.3, Level.USABLE)])
+def test_a_map_that_contradicts_the_one_it_was_replaced_by_makes_a_run_usable(bend: float, level: Level) -> None:
+    truth = ahead()
+    for i, T in truth.items():
+        T[:2, 3] = 2.0 * np.sin(i / 40), np.cos(i / 40)
+    system = run(truth)
+    earlier = Submap(1, np.eye(3), np.zeros(32, np.uint8))
+    for i in range(20, 120, 5):
+        T = truth[i].copy()
+        T[:3, 3] *= 0.4 * (bend if i > 70 else 1.0)
+        earlier.add_keyframe(Keyframe(i, i / 30, NO_FEATURES), T)
+    system.atlas.add(earlier)
+    system.events.add(EventKind.ABSORBED, 150, 5.0, 0, old_submaps=[1], frames=20)
+    verdict = judged(system)
+    assert verdict.level is level
+    about = [(reason.code, reason.first_frame, reason.last_frame) for reason in verdict.reasons]
+    assert about == [(ReasonCode.REPLACED, 20, 115)] * (level is Level.USABLE)
 
 
 def test_a_camera_that_hung_has_not_jumped() -> None:

@@ -150,9 +150,7 @@ def compare(
     T_est = main.T_world_cam[order][known]
     if len(index) < MIN_POSES or frames.is_still:
         return fields
-    untrue = np.zeros(len(index), bool)
-    for span in truth_breaks:
-        untrue |= (span[0] <= index) & (index <= span[1])
+    untrue = are_untrue(index, truth_breaks)
     p, q = T_est[:, :3, 3], T_true[:, :3, 3]
     fields |= _stretches(times_s - frames.times_s[0], p, q, frames.times_s, untrue)
     tolerance_m = None if repeats_m is None else repeats_m / 2.0
@@ -164,6 +162,14 @@ def compare(
         if found.outcome is not JoinOutcome.WRONG or not _touches(index, untrue, first, after)
     )
     return fields
+
+
+def are_untrue(index: IntArray, truth_breaks: Iterable[Sequence[int]]) -> BoolArray:
+    """Return which frames (N,) have a true pose that is known to be wrong; `truth_breaks`: their first and last."""
+    untrue = np.zeros(len(index), bool)
+    for first, last in truth_breaks:
+        untrue |= (first <= index) & (index <= last)
+    return untrue
 
 
 def _touches(index: IntArray, untrue: BoolArray, first: int, after: int) -> bool:

@@ -35,6 +35,7 @@ class ReasonCode(StrEnum):
     STILL = "still"
     CAMERA = "camera"
     SCALE = "scale"
+    REPLACED = "replaced"
     CRASHED = "crashed"
     UNPOSED = "unposed"
     UNJOINED = "unjoined"

@@ -17,7 +17,7 @@ from dualslam.core.geometry import so3
 from dualslam.io.trajectory_files import Trajectory, write_tum
 from dualslam.lab.bench.measure import trajectory_error
 from dualslam.lab.bench.record import Breakage, JoinCause
-from dualslam.lab.bench.truth import TrueFrames, compare, read_verdict, true_frames
+from dualslam.lab.bench.truth import TrueFrames, are_untrue, compare, read_verdict, true_frames
 
 N, RATE_HZ = 240, 20.0
 INDEX = 100 + 2 * np.arange(N)
@@ -131,6 +131,16 @@ def test_what_touches_frames_of_wrong_truth_is_not_held_against_the_run() -> Non
     assert found["excepted"] >= 3
     found = compared(main, submap=submap, truth_breaks=far)
     assert (found["broken"], found["excepted"], len(found["joins"])) == (3, 0, 1)
+
+
+def test_frames_of_wrong_truth_do_not_count_in_the_error() -> None:
+    main, known = estimate(), frames().truth
+    main.T_world_cam[100:120, 0, 3] += 0.5
+    trusted = known.take(~are_untrue(known.index, [[int(INDEX[100]), int(INDEX[119])]]))
+    errors = [trajectory_error(frames().on_true_clock(main), each, TIMES_S)[0] for each in (known, trusted)]
+    assert errors[0] is not None
+    assert errors[0] > 0.1
+    assert errors[1] == pytest.approx(0.0, abs=1e-9)
 
 
 def test_a_verdict_is_read_where_there_is_one() -> None:

@@ -106,6 +106,20 @@ class TestRefine:
         assert bool(calibration.refine(submap)) is changes
         assert correction_of(calibration.camera) == (RIGHT_AGAIN if changes else near)
 
+    @pytest.mark.parametrize(("wrong", "due"), [(1.25, True), (1.03, False)])
+    def test_a_large_correction_is_to_be_confirmed_at_the_end_by_a_map_that_has_grown(
+        self, wrong: float, due: bool
+    ) -> None:
+        found = replace(estimate_of(LensCorrection(log_focal=-np.log(wrong)), True), covariance=0.005**2 * np.eye(5))
+        submap, larger = (make_submap(wrong_camera(wrong), turning=True, n=n) for n in (12, 13))
+        calibration = Calibration(
+            wrong_camera(wrong), CalibrationConfig(), lambda *_: found, lambda submap: adjust_submap(submap, 1.345)
+        )
+        assert calibration.is_due_at_end(submap)
+        assert calibration.refine(submap)
+        assert not calibration.is_due_at_end(submap)
+        assert calibration.is_due_at_end(larger) is due
+
     def test_an_answer_is_asked_for_with_what_was_known_of_the_one_before(self) -> None:
         asked_with: list[FloatArray | None] = []
 
