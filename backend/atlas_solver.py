@@ -75,8 +75,8 @@ class GtsamAtlasSolver:
         found = np.array([solution.S_world_node[i] for i in range(len(problem.S_world_node))])
         return AtlasSolution(found, believed, chi2, solution.cost_before, solution.cost_after, drift)
 
-    def relative_covariance(self, problem: AtlasProblem, first: int, second: int) -> FloatArray:
-        """Return the (7, 7) covariance of ``inv(S_world_first) @ S_world_second``, all edges believed.
+    def relative_covariances(self, problem: AtlasProblem, first: int) -> FloatArray:
+        """Return (N, 7, 7) covariances of ``inv(S_world_first) @ S_world_node``, all edges believed; 0 at the first.
 
         Raises
         ------
@@ -85,10 +85,13 @@ class GtsamAtlasSolver:
         graph = _Graph(problem)
         everything = np.ones(len(problem.edges), bool)
         label = graph.pieces(everything)
-        if label[first] != label[second]:
-            raise SolverError("nothing ties the two keyframes: they have no relative covariance")
+        if (label != label[first]).any():
+            raise SolverError("nothing ties some keyframes to the first: they have no relative covariance")
         graph.take_in_drift(np.array([e.doubtful for e in problem.edges], bool))
-        return graph.optimise(everything).relative_covariances([(first, second)])[0]
+        found = np.zeros((len(label), 7, 7))
+        others = np.delete(np.arange(len(label)), first)
+        found[others] = graph.optimise(everything).relative_covariances([(first, n) for n in others.tolist()])
+        return found
 
     def edge_covariances(
         self, submap: Submap, pairs: Sequence[tuple[int, int]], held: frozenset[int] = frozenset()

@@ -13,7 +13,7 @@ from dualslam.atlas.node_views import NodeViews
 from dualslam.atlas.skeleton import Skeleton, build_skeleton
 from dualslam.atlas.trajectory import FramePose, compose
 from dualslam.atlas.warp import Warp
-from dualslam.core.atlas_problem import AtlasEdges
+from dualslam.core.atlas_problem import AtlasEdges, AtlasSolver
 from dualslam.core.geometry import sim3
 from dualslam.core.metric_problem import MetricProblem, MetricSolution, pose_by_node
 from dualslam.core.trajectory import Trajectory
@@ -75,16 +75,38 @@ class MetricMap:
                 T[here] = sim3.act_on_pose(S, self.frames.T_world_cam[here])
         return Trajectory(self.frames.timestamps_s, T, self.frames.index)
 
-    def covariances(self, solution: MetricSolution) -> FloatArray:
-        """Return (F, 6, 6) of the placed frames: right perturbation, rotation (rad), then translation (metres).
+    def relative_covariances(self, solver: AtlasSolver) -> FloatArray:
+        """Return (F, 6, 6) of the frames relative to the node of the first one, whose scale holds the unit.
 
-        Each frame stands rigidly beside its node: what is uncertain between them, within ten keyframes, is left out.
+        Raises `SolverError`.
         """
-        S_node_world = sim3.inverse(self.problem.S_world_node)[self.node]
-        T_node_cam = sim3.act_on_pose(S_node_world, self.frames.T_world_cam)
-        scale = sim3.scale(solution.S_metric_node)[self.node]
-        J = np.array([pose_by_node(s, T) for s, T in zip(scale.tolist(), T_node_cam, strict=True)])
-        return np.asarray(J @ solution.covariance[self.node] @ J.swapaxes(1, 2))
+        of_node = solver.relative_covariances(self.skeleton.problem, int(self.problem.node[0]))
+        return self.covariances(self.problem.S_world_node, of_node)
+
+    def covariances(self, S_frame_node: FloatArray, of_node: FloatArray) -> FloatArray:
+        """Return (F, 6, 6) of the frames: right perturbation, rotation (rad), then translation (unit of the frame).
+
+        Variances grow linearly from one node to the next, as those of a random walk do.
+
+        - `S_frame_node`, `of_node` (N, 4, 4), (N, 7, 7): the nodes in a common frame, and their covariances.
+        """
+        C = np.empty((len(self.frames), 6, 6))
+
+        def beside(frame: IntArray, node: IntArray) -> FloatArray:
+            S_node_world = sim3.inverse(self.problem.S_world_node[node])
+            T_node_cam = sim3.act_on_pose(S_node_world, self.frames.T_world_cam[frame])
+            scale = sim3.scale(S_frame_node[node]).tolist()
+            J = np.array([pose_by_node(s, T) for s, T in zip(scale, T_node_cam, strict=True)]).reshape(-1, 6, 7)
+            return np.asarray(J @ of_node[node] @ J.swapaxes(1, 2))
+
+        for m in self.skeleton.component:
+            rows, knots = (np.array(each) for each in self.skeleton.knots(m))
+            here = np.flatnonzero(self.submap == m)
+            place = np.interp(self.frames.index[here], knots, np.arange(len(knots)))
+            before = place.astype(int)
+            after, share = np.minimum(before + 1, len(knots) - 1), (place - before)[:, None, None]
+            C[here] = (1 - share) * beside(here, rows[before]) + share * beside(here, rows[after])
+        return C
 
     def refuted(self, solution: MetricSolution) -> list[Link]:
         """Return the links that the measurements contradict."""

@@ -104,10 +104,10 @@ class AtlasSolver(Protocol):
         """
         ...
 
-    def relative_covariance(self, problem: AtlasProblem, first: int, second: int) -> FloatArray:
-        """Return the (7, 7) covariance of ``inv(S_world_first) @ S_world_second`` (right perturbation), as solved.
+    def relative_covariances(self, problem: AtlasProblem, first: int) -> FloatArray:
+        """Return (N, 7, 7) covariances of ``inv(S_world_first) @ S_world_node`` (right perturbation), as solved.
 
-        Raises `SolverError`: also where nothing ties the two.
+        Raises `SolverError`: also where nothing ties some node to the first.
         """
         ...
 

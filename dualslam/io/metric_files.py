@@ -33,17 +33,23 @@ def write_metric(
     - `covariance` (F, 6, 6): of each: right perturbation, rotation (rad), then translation (metres).
     - `exports`: texts of further files by name.
     """
-    order = frames.timestamps_s.argsort(kind="stable")
-    frames, covariance = frames.in_time_order(), covariance[order]
+    write_covariances(folder, frames, covariance)
+    frames = frames.in_time_order()
     write_tum(folder / TRAJECTORY_METRIC, frames)
-    with atomic_file(folder / COVARIANCES) as file:
-        np.savez_compressed(file, index=frames.index, timestamp_s=frames.timestamps_s, covariance=covariance)
     for name, text in exports.items():
         write_text(folder / name, text)
     if origin is not None:
         llh = from_enu(frames.T_world_cam[:, :3, 3], origin)
         write_text(folder / GPX, _gpx(frames.timestamps_s, llh))
         write_text(folder / GEOJSON, _geojson(frames, llh))
+
+
+def write_covariances(folder: Path, frames: Trajectory, covariance: FloatArray) -> None:
+    """Write covariances (F, 6, 6) of frames, in order of time."""
+    order = frames.timestamps_s.argsort(kind="stable")
+    frames, covariance = frames.in_time_order(), covariance[order]
+    with atomic_file(folder / COVARIANCES) as file:
+        np.savez_compressed(file, index=frames.index, timestamp_s=frames.timestamps_s, covariance=covariance)
 
 
 def _gpx(times_s: FloatArray, llh: FloatArray) -> str:

@@ -15,13 +15,14 @@ from dualslam.atlas.atlas import Atlas, Link
 from dualslam.atlas.metric import MetricMap
 from dualslam.atlas.trajectory import FramePose
 from dualslam.build.parts import MetricParts
+from dualslam.core.atlas_problem import AtlasSolver
 from dualslam.core.columns import concatenate
 from dualslam.core.errors import InputError, SolverError
 from dualslam.core.metric_problem import MeasurementSource, MetricSolution, RowSource
 from dualslam.core.trajectory import Trajectory
 from dualslam.core.types import FloatArray
 from dualslam.io.measurements import read_measurements
-from dualslam.io.metric_files import write_metric
+from dualslam.io.metric_files import write_covariances, write_metric
 from dualslam.io.metric_scale import write_scale
 
 log = logging.getLogger(__name__)
@@ -155,14 +156,42 @@ def measure(
             placed.append((other, of_other))
             alone += component
     origin = next((s.origin for s in sources if s.origin is not None), None)
-    covariance = np.concatenate([m.covariances(s) for m, s in placed])
+    covariance = np.concatenate([m.covariances(s.S_metric_node, s.covariance) for m, s in placed])
     return Measured(concatenate([m.placed(s) for m, s in placed]), covariance, solution, alone, undone, origin)
+
+
+def write_relative(
+    folder: Path,
+    atlas: Atlas,
+    poses: Mapping[int, FramePose],
+    main: list[int],
+    solver: AtlasSolver,
+    index_of: Mapping[int, int],
+) -> None:
+    """Write the covariances of the main map's frames relative to the first one, for a run without measurements."""
+    try:
+        metric = MetricMap.of(atlas, list(poses.values()), main, solver.edge_covariances)
+        covariance = None if metric is None else metric.relative_covariances(solver)
+    except SolverError as error:
+        log.warning("the frames have no covariances: %s", error)
+        return
+    if metric is not None and covariance is not None:
+        frames, covariance = _of_source(metric.frames, covariance, index_of)
+        write_covariances(folder, frames, covariance)
+
+
+def _of_source(
+    frames: Trajectory, covariance: FloatArray, index_of: Mapping[int, int]
+) -> tuple[Trajectory, FloatArray]:
+    """Return those frames that the source has, by its numbers."""
+    kept = np.array([i in index_of for i in frames.index.tolist()], bool)
+    frames = frames.take(kept)
+    index = np.array([index_of[i] for i in frames.index.tolist()], np.int64)
+    return replace(frames, index=index), covariance[kept]
 
 
 def write_measured(folder: Path, measured: Measured, index_of: Mapping[int, int]) -> None:
     """Write the metric files of a run folder; `index_of`: of a frame's number in the source, where it has one."""
-    kept = np.array([i in index_of for i in measured.frames.index.tolist()], bool)
-    frames = measured.frames.take(kept)
-    frames = replace(frames, index=np.array([index_of[i] for i in frames.index.tolist()], np.int64))
-    write_metric(folder, frames, measured.covariance[kept], measured.main.exports, measured.origin)
+    frames, covariance = _of_source(measured.frames, measured.covariance, index_of)
+    write_metric(folder, frames, covariance, measured.main.exports, measured.origin)
     write_scale(folder, measured.main.metres_per_unit, measured.main.scale_sigma, "measurements")

@@ -14,7 +14,7 @@ from typing import Any, Protocol
 
 from dualslam import __version__
 from dualslam.build import build_system
-from dualslam.build.parts import metric_parts
+from dualslam.build.parts import atlas_solver, metric_parts
 from dualslam.core.camera.base import Camera
 from dualslam.core.camera.focal import FocalSearch
 from dualslam.core.config.files import dump_config
@@ -42,7 +42,7 @@ from dualslam.run.front_end import with_frontend_chosen
 from dualslam.run.interrupts import Interrupts
 from dualslam.run.judgement import judge_run
 from dualslam.run.map_camera import camera_that_fits, in_size_of_map
-from dualslam.run.measuring import Measured, measure, write_measured
+from dualslam.run.measuring import Measured, measure, write_measured, write_relative
 from dualslam.run.no_map import StartRefusals
 from dualslam.run.results import Trajectories, frame_rows, summarise, trajectories_of, truth_of_frames
 from dualslam.run.runner import RunReport, run_sequence
@@ -458,9 +458,13 @@ def _write_results(
     if truth is not None and "no_errors" not in summary:
         folder.write_truth(truth_of_frames(truth, rows))
     save_atlas(folder.map_path, system.atlas, system.poses, system.camera)
+    index_of = {i: system.numbers.index_of(i) for i in system.rows}
     if measured is not None:
-        write_measured(folder.path, measured, {i: system.numbers.index_of(i) for i in system.rows})
+        write_measured(folder.path, measured, index_of)
         log.info("%s", measured.line())
+    elif len(trajectories.main):
+        solver = atlas_solver(config)
+        write_relative(folder.path, system.atlas, system.poses, trajectories.main_submaps, solver, index_of)
     return summary, trajectories
 
 

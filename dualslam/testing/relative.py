@@ -38,4 +38,4 @@ def relative_similarity(atlas: Atlas, solver: AtlasSolver, a: Node, b: Node) -> 
     )
     first, second = (skeleton.nodes.index(node) for node in (a, b))
     S = skeleton.problem.S_world_node
-    return sim3.inverse(S[first]) @ S[second], solver.relative_covariance(skeleton.problem, first, second)
+    return sim3.inverse(S[first]) @ S[second], solver.relative_covariances(skeleton.problem, first)[second]

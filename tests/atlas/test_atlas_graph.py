@@ -474,5 +474,5 @@ def test_each_edge_goes_from_a_keyframe_to_a_keyframe() -> None:
     solution = GtsamAtlasSolver(True, 0.8).solve(problem)
     np.testing.assert_array_equal(solution.S_world_node, problem.S_world_node)
     np.testing.assert_allclose(
-        GtsamAtlasSolver(True, 0.8).relative_covariance(problem, 0, 1), np.eye(7), rtol=1e-4, atol=1e-5
+        GtsamAtlasSolver(True, 0.8).relative_covariances(problem, 0)[1], np.eye(7), rtol=1e-4, atol=1e-5
     )

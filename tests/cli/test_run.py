@@ -57,6 +57,7 @@ def test_a_run_leaves_all_that_it_should(
     assert (judged["level"], judged["reasons"]) == ("good", [])
     assert judged["scores"]["jump"] < 2.0
     assert len(rows_of(out)) == len((out / "trajectory.txt").read_text().splitlines()) == N_FRAMES
+    assert np.load(out / "covariances.npz")["covariance"].shape == (N_FRAMES, 6, 6)
     assert all(row["in_main_map"] == "1" and row["status"] == "tracked" for row in rows_of(out))
     assert json.loads((out / "events.jsonl").read_text().splitlines()[0])["event"] == "initialised"
     assert load_config(out / "config.yaml") == load_config(None, ["seed=3", "frontend.name=orb"])

@@ -8,13 +8,15 @@ import numpy as np
 import pytest
 
 from dualslam.atlas.atlas import LinkKind
-from dualslam.build.parts import measurement_sources, metric_parts
+from dualslam.atlas.metric import MetricMap
+from dualslam.build.parts import atlas_solver, measurement_sources, metric_parts
 from dualslam.core.config.files import load_config
 from dualslam.core.errors import InputError
+from dualslam.core.geometry import sim3
 from dualslam.core.metric_problem import MeasurementRow, RowSource
 from dualslam.core.trajectory import Trajectory
 from dualslam.lab.simulated_measurements import Receiver, csv_text
-from dualslam.run.measuring import measure, read_rows, write_measured
+from dualslam.run.measuring import measure, read_rows, write_measured, write_relative
 from dualslam.testing.atlas_world import DriftingMap
 
 FIRST, SECOND = range(60), range(64, 120)
@@ -95,3 +97,25 @@ def test_files_are_read_with_one_origin_and_named_in_errors(world: DriftingMap, 
     in_ms = RowSource("ms", [replace(r, values=(1e3 * r.values[0], *r.values[1:])) for r in positions(world).rows])
     with pytest.raises(InputError, match="seem to be in milliseconds"):
         measured_of(world, replace(in_ms, rows=[r for r in in_ms.rows if r.values[0] > 20.0]))
+
+
+def test_covariances_without_measurements_grow_from_the_first_frame(world: DriftingMap, tmp_path):
+    solver = atlas_solver(load_config())
+    metric = MetricMap.of(world.atlas, list(world.record.poses.values()), [0], solver.edge_covariances)
+    assert metric is not None
+    C = metric.relative_covariances(solver)
+    assert not C[0].any()
+    rows, knots = metric.skeleton.knots(0)
+    trace = np.trace(C[:, 3:, 3:], axis1=1, axis2=2)
+    assert (np.diff(trace[knots]) > 0).all()
+    # At a node they are its own, in the unit of the world; half way to the next, half of both.
+    own = solver.relative_covariances(metric.skeleton.problem, 0)[rows[1]]
+    scale = sim3.scale(metric.problem.S_world_node[rows[1]])
+    np.testing.assert_allclose(C[knots[1], 3:, 3:], scale**2 * own[3:6, 3:6], rtol=1e-6)
+    assert (np.linalg.eigvalsh(C[1:]) > 0).all()
+    middle = (knots[1] + knots[2]) // 2
+    assert trace[knots[1]] < trace[middle] < trace[knots[2]]
+    write_relative(tmp_path, world.atlas, world.record.poses, [0], solver, {k: 100 + k for k in FIRST})
+    written = np.load(tmp_path / "covariances.npz")
+    assert written["index"].tolist() == [100 + k for k in FIRST]
+    np.testing.assert_allclose(written["covariance"], C)
