@@ -45,22 +45,12 @@ def scale_sigma_between(submap: Submap, here: IntArray, there: IntArray, pixel_c
     Returns float: inflated as the links' own covariances are. Infinite where the places do not hang together, or one is
     empty.
     """
-    return scale_sigmas_between(submap, [(here, there)], pixel_chi2)[0]
-
-
-def scale_sigmas_between(
-    submap: Submap, places: Sequence[tuple[IntArray, IntArray]], pixel_chi2: float, n_around: int = N_AROUND
-) -> list[float]:
-    """Return the same for several pairs of places that lie near each other, from one set of normal equations.
-
-    `n_around`: keyframes before and after them that count as well.
-    """
-    return answer_scale(ask_scale(submap, places, pixel_chi2, n_around))
+    return answer_scale(ask_scale(submap, [(here, there)], pixel_chi2))[0]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ScaleQuestion:
-    """All that `scale_sigmas_between` needs of a submap: arrays of its own. It can be pickled."""
+    """All that `answer_scale` needs of a submap: arrays of its own. It can be pickled."""
 
     places: Sequence[tuple[IntArray, IntArray]]  # sequence of (IntArray, IntArray): keyframe ids of the pairs of places
     pixel_chi2: float
@@ -78,7 +68,11 @@ class ScaleQuestion:
 def ask_scale(
     submap: Submap, places: Sequence[tuple[IntArray, IntArray]], pixel_chi2: float, n_around: int = N_AROUND
 ) -> ScaleQuestion:
-    """Collect what `answer_scale` needs for an answer, which takes longer and may be given elsewhere."""
+    """Collect what `answer_scale` needs for an answer, which takes longer and may be given elsewhere.
+
+    - `places`: pairs of places as in `scale_sigma_between`, answered from one set of normal equations.
+    - `n_around`: keyframes before and after them that count as well.
+    """
     held = np.array(sorted(submap.keyframes), np.int64)
     pairs = [(here[np.isin(here, held)], there[np.isin(there, held)]) for here, there in places]
     asked = np.concatenate([ids for pair in pairs for ids in pair])
@@ -95,7 +89,7 @@ def ask_scale(
 
 
 def answer_scale(question: ScaleQuestion) -> list[float]:
-    """Return what `scale_sigmas_between` does."""
+    """Return what `scale_sigma_between` does, for each pair of places."""
     problem = _linearise(question)
     if problem is None:
         return [np.inf] * len(question.places)
