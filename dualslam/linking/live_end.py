@@ -25,7 +25,6 @@ from dualslam.core.geometry import se3, sim3, so3
 from dualslam.core.noise_model import GROUP
 from dualslam.core.types import Failure, FailureReason, FloatArray, IntArray
 from dualslam.linking.estimate import LinkEstimate, LinkRefusal
-from dualslam.linking.gates import PIXEL_CHI2
 from dualslam.linking.join_test import LinkEvidence, live_scale_gate
 from dualslam.linking.scale_observability import scale_sigma_between
 from dualslam.map.submap import Submap
@@ -154,7 +153,7 @@ def propagate_to_live_end(
     `sigma_scale_reverse`, and the camera's, `sigma_scale_camera`, where there is one.
     """
     live = np.array([k for k in new.keyframes if k >= live_since], np.int64)
-    walk = scale_sigma_between(new, link.agreeing_keyframes, live, PIXEL_CHI2)
+    walk = scale_sigma_between(new, link.agreeing_keyframes, live)
     sigma = math.hypot(link.sigma_scale, walk, bend.log_scale)
     numbers = {"sigma_scale": sigma, "sigma_scale_reverse": walk}
     if bend.log_scale:

@@ -21,6 +21,7 @@ from dualslam.core.geometry.projection import project_points, projection_jacobia
 from dualslam.core.noise_model import GROUP
 from dualslam.core.sums import sum_by
 from dualslam.core.types import FloatArray, IntArray
+from dualslam.linking.gates import PIXEL_CHI2
 from dualslam.map.submap import Submap
 
 N_AROUND = 2 * GROUP
@@ -33,19 +34,18 @@ NO_TIE = 1e-7
 """Relative to the median stiffness: directions that are softer than this are as free as the gauge."""
 
 
-def scale_sigma_between(submap: Submap, here: IntArray, there: IntArray, pixel_chi2: float) -> float:
+def scale_sigma_between(submap: Submap, here: IntArray, there: IntArray) -> float:
     """Return the standard deviation of the log of the scale at one place relative to another.
 
     - `submap`: solved. Its keyframes from the first to the last of those given, and some around, count with what they
       saw.
     - `here`, `there`: keyframe ids of the two places, which may overlap; those that the submap does not hold are passed
       over.
-    - `pixel_chi2`: observations that are off by more than this tell nothing.
 
     Returns float: inflated as the links' own covariances are. Infinite where the places do not hang together, or one is
     empty.
     """
-    return answer_scale(ask_scale(submap, [(here, there)], pixel_chi2))[0]
+    return answer_scale(ask_scale(submap, [(here, there)]))[0]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -53,7 +53,6 @@ class ScaleQuestion:
     """All that `answer_scale` needs of a submap: arrays of its own. It can be pickled."""
 
     places: Sequence[tuple[IntArray, IntArray]]  # sequence of (IntArray, IntArray): keyframe ids of the pairs of places
-    pixel_chi2: float
     K: FloatArray  # (3, 3)
     ids: IntArray  # (F,): keyframes that count; none where there is no place
     T_submap_kf: FloatArray  # (F, 4, 4)
@@ -65,9 +64,7 @@ class ScaleQuestion:
     sigma_px: FloatArray  # (R,)
 
 
-def ask_scale(
-    submap: Submap, places: Sequence[tuple[IntArray, IntArray]], pixel_chi2: float, n_around: int = N_AROUND
-) -> ScaleQuestion:
+def ask_scale(submap: Submap, places: Sequence[tuple[IntArray, IntArray]], n_around: int = N_AROUND) -> ScaleQuestion:
     """Collect what `answer_scale` needs for an answer, which takes longer and may be given elsewhere.
 
     - `places`: pairs of places as in `scale_sigma_between`, answered from one set of normal equations.
@@ -85,7 +82,7 @@ def ask_scale(
     uv, sigma = submap.observed_pixels(rows)
     landmarks, point = np.unique(obs["landmark"][rows], return_inverse=True)
     kf, xyz = np.searchsorted(ids, obs["kf"][rows]), submap.landmarks["xyz_mu"][landmarks]
-    return ScaleQuestion(pairs, pixel_chi2, submap.K, ids, submap.keyframe_poses(ids), xyz, kf, point, uv, sigma)
+    return ScaleQuestion(pairs, submap.K, ids, submap.keyframe_poses(ids), xyz, kf, point, uv, sigma)
 
 
 def answer_scale(question: ScaleQuestion) -> list[float]:
@@ -143,7 +140,7 @@ def _linearise(question: ScaleQuestion) -> _Problem | None:
         seen = seen[all_xyz[seen] @ T[f, 2, :3] + T[f, 2, 3] > 0]
         J_pose[seen], J_point[seen] = projection_jacobians(q.K, T[f], all_xyz[seen])
         predicted, _ = project_points(q.K, T[f], all_xyz[seen])
-        good[seen] = ((predicted - q.uv_px[seen]) ** 2).sum(1) < q.pixel_chi2 * q.sigma_px[seen] ** 2
+        good[seen] = ((predicted - q.uv_px[seen]) ** 2).sum(1) < PIXEL_CHI2 * q.sigma_px[seen] ** 2
     # A point seen once says nothing of the poses.
     good &= np.bincount(q.point[good], minlength=len(q.xyz))[q.point] >= 2
     kf, weight = q.kf[good], 1.0 / q.sigma_px[good] ** 2

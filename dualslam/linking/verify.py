@@ -9,7 +9,6 @@ import numpy as np
 from dualslam.core.config.settings import LinkingConfig
 from dualslam.core.geometry import se3, sim3
 from dualslam.core.types import FloatArray, IntArray
-from dualslam.linking.gates import PIXEL_CHI2
 from dualslam.linking.join_test import LinkEvidence, parting_gate, similarity_gates, support_gate
 from dualslam.linking.pairs import PairModel
 from dualslam.linking.scale_observability import scale_sigma_between
@@ -25,7 +24,7 @@ def judge_parting(
     parted: IntArray,
 ) -> LinkEvidence:
     """Judge maps that agree on a similarity at some keyframes (ids), and part at newer ones."""
-    sigma_old, sigma_new = (scale_sigma_between(m, agreeing, parted, PIXEL_CHI2) for m in (old, new))
+    sigma_old, sigma_new = (scale_sigma_between(m, agreeing, parted) for m in (old, new))
     apart = _log_scale_at(model, parted) - math.log(sim3.scale(S_old_new))
     return LinkEvidence((parting_gate(apart, sigma_old, sigma_new, len(parted)),))
 

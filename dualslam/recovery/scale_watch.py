@@ -20,7 +20,6 @@ from dualslam.core.config.settings import LinkingConfig
 from dualslam.core.jobs import Desk, Handlers, InlineDesk, JobKind
 from dualslam.core.noise_model import GROUP
 from dualslam.core.types import Failure, FloatArray, IntArray
-from dualslam.linking.gates import PIXEL_CHI2
 from dualslam.linking.scale_observability import N_AROUND, ScaleQuestion, answer_scale, ask_scale
 from dualslam.map.submap import Submap
 
@@ -149,7 +148,7 @@ def question_about(
         seen = submap.covisible(submap.landmarks_of_keyframes(ids[ids >= after[0]]))[0]
         earliest = ids[max(int(np.searchsorted(ids, before[0])) - N_AROUND, 0)]
         n_around = len(ids) if (seen < earliest).any() else N_AROUND
-    return ask_scale(submap, [(before, after)], PIXEL_CHI2, n_around)
+    return ask_scale(submap, [(before, after)], n_around)
 
 
 def count_ties(submap: Submap, ids: IntArray, end: int, begin: int, n_views: int = 1) -> int:

@@ -13,7 +13,6 @@ import numpy as np
 from dualslam.core.geometry import se3
 from dualslam.core.noise_model import GROUP
 from dualslam.core.types import FloatArray
-from dualslam.linking.gates import PIXEL_CHI2
 from dualslam.linking.scale_observability import answer_scale, ask_scale
 from dualslam.map.landmark_views import landmark_covariances, noise_excess, resection_covariance
 from dualslam.map.submap import Submap
@@ -70,7 +69,7 @@ def _scale_sigmas(submap: Submap, excess: dict[int, float]) -> dict[int, float]:
     """
     ids = np.array(sorted(submap.keyframes), np.int64)
     groups = [ids[begin : begin + GROUP] for begin in range(0, len(ids), GROUP)]
-    question = ask_scale(submap, [(group, ids) for group in groups], PIXEL_CHI2, n_around=0)
+    question = ask_scale(submap, [(group, ids) for group in groups], n_around=0)
     noise = np.array([excess[k] for k in question.ids.tolist()])[question.kf]
     sigmas = answer_scale(replace(question, sigma_px=noise * question.sigma_px))
     can_tell = len(groups) > 1 and bool(submap.landmarks["alive"].any())

@@ -15,7 +15,7 @@ from dualslam.core.types import Failure, FailureReason, FloatArray, IntArray
 from dualslam.linking import DescriptorMatcher, LinkEstimate, estimate, estimate_link, propagate_to_live_end
 from dualslam.linking.correspondences import propose_correspondences
 from dualslam.linking.estimate import LinkRefusal
-from dualslam.linking.gates import MIN_TIES, MINORITY_DEFORMATION, PIXEL_CHI2
+from dualslam.linking.gates import MIN_TIES, MINORITY_DEFORMATION
 from dualslam.linking.join_test import LinkEvidence
 from dualslam.linking.pairs import PairModel
 from dualslam.linking.scale_observability import scale_sigma_between
@@ -68,27 +68,25 @@ def test_the_sigma_is_that_of_the_error(layout: str) -> None:
     whitened = []
     for seed in range(8):
         world, submap = solved(layout, seed)
-        sigma = scale_sigma_between(submap, HERE, THERE, PIXEL_CHI2)
+        sigma = scale_sigma_between(submap, HERE, THERE)
         whitened.append((log_scale(world, submap, THERE) - log_scale(world, submap, HERE)) / sigma)
     assert 0.2 < np.sqrt(np.mean(np.square(whitened))) < 2.0, whitened
 
 
 def test_fewer_ties_hold_less_and_none_hold_nothing() -> None:
     _, submap = solved("street", 0)
-    sigmas = [
-        scale_sigma_between(thinned(submap, 12 * FRAME_STEP, n), HERE, THERE, PIXEL_CHI2) for n in (1000, 30, 12, 0)
-    ]
+    sigmas = [scale_sigma_between(thinned(submap, 12 * FRAME_STEP, n), HERE, THERE) for n in (1000, 30, 12, 0)]
     assert (np.diff(sigmas) > 0).all()
     assert sigmas[2] > 2 * sigmas[0]
     assert sigmas[3] == np.inf
-    assert scale_sigma_between(submap, HERE, np.array([10_000]), PIXEL_CHI2) == np.inf
+    assert scale_sigma_between(submap, HERE, np.array([10_000])) == np.inf
 
 
 def test_the_unit_does_not_matter() -> None:
     _, submap = solved("room", 1)
-    before = scale_sigma_between(submap, HERE, THERE, PIXEL_CHI2)
+    before = scale_sigma_between(submap, HERE, THERE)
     submap.transform(7.0, se3.exp(np.array([0.3, -0.2, 0.5, 3.0, 1.0, -2.0])))
-    assert scale_sigma_between(submap, HERE, THERE, PIXEL_CHI2) == pytest.approx(before, rel=1e-3)
+    assert scale_sigma_between(submap, HERE, THERE) == pytest.approx(before, rel=1e-3)
 
 
 # --- the live end
@@ -139,7 +137,7 @@ def test_what_more_keyframes_cannot_cure_is_said_to_be_lost() -> None:
     case, link = linked()
     live_since = int(THERE[0])
     live = np.array([k for k in case.new.keyframes if k >= live_since])
-    walk = scale_sigma_between(case.new, link.agreeing_keyframes, live, PIXEL_CHI2)
+    walk = scale_sigma_between(case.new, link.agreeing_keyframes, live)
     strict = CONFIG.model_copy(update={"wrong_scale": 2 * walk / 1.5})
     assert len(link.agreeing_keyframes) >= 4
     reasons = []
@@ -213,7 +211,7 @@ def test_it_is_not_where_the_maps_part_by_more_than_it_leaves_open(rate: float, 
     """Two landmarks hold the old map to 7 %: that explains a few per cent, and not a quarter."""
     case, _ = bent_walk(0, rate)
     loose = thinned(case.old, 10 * FRAME_STEP, 2)
-    sigmas = [scale_sigma_between(m, AGREEING, PARTED, PIXEL_CHI2) for m in (loose, case.new)]
+    sigmas = [scale_sigma_between(m, AGREEING, PARTED) for m in (loose, case.new)]
     assert GATE_SIGMAS * sigmas[1] < sigmas[0] < 0.1
     refused = blame(case, loose, case.new)
     assert (refused is None) is is_possible
