@@ -10,7 +10,7 @@ there.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -21,24 +21,10 @@ from dualslam.core.config.settings import LinkingConfig
 from dualslam.core.events import EventKind
 from dualslam.core.noise_model import GROUP
 from dualslam.core.types import BoolArray, IntArray
-from dualslam.linking.scale_observability import N_AROUND, answer_scale
-from dualslam.map.landmark_views import noise_excess
+from dualslam.linking.scale_observability import scale_sigmas_in_all
 from dualslam.map.split import submap_of
 from dualslam.map.submap import Submap
-from dualslam.recovery.scale_watch import FIRM_TIES, SCALE_INFLATION, count_ties, lost_from, question_about
-
-SPAN = 2
-"""Groups of keyframes across which the scale is asked for: a blurred turn may take longer than one, and hand on a
-little from each to the next."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Loss:
-    """Where a map does not hand its scale on, seen from a place outward."""
-
-    between: IntArray  # (N,): keyframes that may be of either scale
-    beyond: IntArray  # (M,): those of another one
-    sigma: float  # standard deviation of its logarithm
+from dualslam.recovery.scale_watch import FIRM_TIES, count_ties, lost_from
 
 
 def part_what_lost_its_scale(record: Record, submap_id: int, config: LinkingConfig, now: FrameStamp) -> None:
@@ -56,79 +42,41 @@ def part_what_lost_its_scale(record: Record, submap_id: int, config: LinkingConf
     if not held:
         return
     for later in (True, False):
-        scales = _Scales(submap)
-        outward = scales.ids if later else scales.ids[::-1]
-        loss = _outermost_loss(
-            record.atlas, submap_id, scales, outward, np.isin(outward, list(held)), lost_from(config)
-        )
-        if loss is None:
-            continue
-        rest = sorted([*loss.between.tolist(), *loss.beyond.tolist()])
+        ids = np.array(sorted(submap.keyframes.keys() - submap.condemned), np.int64)
+        if all(count_ties(submap, ids, at, at, n_views=2) >= FIRM_TIES for at in range(GROUP, len(ids), GROUP)):
+            return
+        outward = ids if later else ids[::-1]
+        rest, sigma = _outermost_loss(record.atlas, submap, outward, np.isin(outward, list(held)), lost_from(config))
         if len(rest) > 1:  # a submap has two keyframes at least
             anchor = int(outward[len(outward) - len(rest) - 1])
-            _part_off(record, submap, rest, anchor, loss.sigma, now)
+            _part_off(record, submap, sorted(rest.tolist()), anchor, sigma, now)
 
 
 def _outermost_loss(
-    atlas: Atlas, submap_id: int, scales: _Scales, outward: IntArray, is_held: BoolArray, max_sigma: float
-) -> _Loss | None:
-    """Return the loss of scale farthest out, seen from the link before it, beyond which nothing is tied to the rest.
+    atlas: Atlas, submap: Submap, outward: IntArray, is_held: BoolArray, max_sigma: float
+) -> tuple[IntArray, float]:
+    """Return the keyframes behind the loss of scale farthest out, seen from a link, that nothing else ties to the rest.
 
-    `outward` (G,): keyframes; `is_held` (G,): whether a link stands there.
+    - `outward` (F,): keyframes; `is_held` (F,): whether a link stands there.
+    - `max_sigma`: of the logarithm of the scale, from which on it is lost.
+
+    Returns (IntArray, float): empty where there is none; and how well the scale is known where it is first lost.
     """
-    rows = np.flatnonzero(is_held)
-    for first, following in zip(rows[::-1].tolist(), [len(outward), *rows[:0:-1].tolist()], strict=True):
-        if following - first <= SPAN * GROUP and following < len(outward):
-            continue  # the next link is too near for a loss in between
-        for loss in scales.losses(outward[max(first - GROUP + 1, 0) :], max_sigma):
-            if np.isin(loss.between, outward[is_held]).any():
-                break  # it is seen from the next link
-            if not _is_held(atlas, submap_id, loss.beyond):
-                return loss
-    return None
-
-
-class _Scales:
-    """Asks a submap how well it hands its scale on from place to place.
-
-    Attributes
-    ----------
-    ids : (F,) int64
-        Its keyframes that are not condemned, ascending.
-    """
-
-    def __init__(self, submap: Submap) -> None:
-        self._submap = submap
-        self._excess = noise_excess(submap)
-        self.ids = np.array(sorted(submap.keyframes.keys() - submap.condemned), np.int64)
-
-    def losses(self, outward: IntArray, max_sigma: float) -> Iterator[_Loss]:
-        """Yield the places at which the scale is lost, one after the other.
-
-        - `outward` (G,): keyframes from a group of those that have the right scale on.
-        - `max_sigma`: of the logarithm of the scale, from which on it is lost.
-        """
-        groups = [outward[begin : begin + GROUP] for begin in range(0, len(outward), GROUP)]
-        for n in range(1, len(groups)):
-            known = max(n - 1 - SPAN, 0)
-            if (sigma := self._sigma(groups, known, n, max_sigma)) > max_sigma:
-                yield _Loss(outward[GROUP * (known + 1) : GROUP * n], outward[GROUP * n :], sigma)
-
-    def _sigma(self, groups: list[IntArray], known: int, asked: int, max_sigma: float) -> float:
-        """Return the standard deviation of the log of the scale of one group against that of another; 0 where firm."""
-        before, after = sorted((np.sort(groups[known]), np.sort(groups[asked])), key=lambda group: int(group[0]))
-        begin, end = np.searchsorted(self.ids, [before[-1] + 1, after[0]]).tolist()
-        if count_ties(self._submap, self.ids, begin, end, n_views=2) >= FIRM_TIES:
-            return 0.0
-        through = np.concatenate(groups[known : asked + 1]).tolist()
-        inflation = SCALE_INFLATION * max(self._excess[k] for k in through)
-        # What keyframes farther off have seen makes it no worse, and costs the cube of their number.
-        for n_around in (N_AROUND, None):
-            question = question_about(self._submap, self.ids, before, after, n_around)
-            sigma = inflation * answer_scale(question)[0]
-            if sigma <= max_sigma:
-                break
-        return sigma
+    links = np.flatnonzero(is_held & ~np.append(is_held[1:], False))[::-1].tolist()
+    places = [
+        (outward[begin : begin + GROUP], outward[max(link - GROUP + 1, 0) : link + 1])
+        for link in links
+        for begin in range(link + 1, len(outward), GROUP)
+    ]
+    sigmas = iter(scale_sigmas_in_all(submap, places))
+    for link in links:
+        begins = np.arange(link + 1, len(outward), GROUP)
+        sigma = np.array([next(sigmas) for _ in begins])
+        n_lost = int(np.minimum.accumulate(sigma[::-1] > max_sigma).sum())
+        # The first group may have keyframes of either scale: what ties it may tie the others of it.
+        if n_lost and not _is_held(atlas, submap.id, outward[begins[-max(n_lost - 1, 1)] :]):
+            return outward[begins[-n_lost] :], float(sigma[-n_lost])
+    return outward[:0], 0.0
 
 
 def _where_links_stand(atlas: Atlas, submap_id: int) -> set[int]:

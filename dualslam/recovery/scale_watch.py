@@ -20,12 +20,9 @@ from dualslam.core.config.settings import LinkingConfig
 from dualslam.core.jobs import Desk, Handlers, InlineDesk, JobKind
 from dualslam.core.noise_model import GROUP
 from dualslam.core.types import Failure, FloatArray, IntArray
-from dualslam.linking.scale_observability import N_AROUND, ScaleQuestion, answer_scale, ask_scale
+from dualslam.linking.scale_observability import N_AROUND, SCALE_INFLATION, ScaleQuestion, answer_scale, ask_scale
 from dualslam.map.submap import Submap
 
-SCALE_INFLATION = 1.8
-"""Errors of neighbouring pixels and views are alike, and do not average out as the sigmas suppose. Chosen so that what
-is true comes to what is claimed on plain stretches (`benchmarks/covariances.py`, seeds 1 to 3)."""
 BEHIND = 2 * GROUP
 """Keyframes after a group before it is tested."""
 SURE = 0.9
@@ -134,21 +131,18 @@ class ScaleWatch:
         return None if _is_linked(submap.id, first, links) else ScaleLoss(int(group[0]), first, sigma)
 
 
-def question_about(
-    submap: Submap, ids: IntArray, before: IntArray, after: IntArray, n_around: int | None = None
-) -> ScaleQuestion:
+def question_about(submap: Submap, ids: IntArray, before: IntArray, after: IntArray) -> ScaleQuestion:
     """Ask what the map claims of its scale at one place, against that at an earlier one.
+
+    Few keyframes around count as well, but all where others than those just before have seen the same as those after:
+    they may hold the places together.
 
     - `ids` (F,): its keyframes, ascending.
     - `before`, `after` (P,): keyframes of the two places.
-    - `n_around`: keyframes before and after them that count as well. By default few, and all where others than those
-      just before have seen the same as those after: they may hold the places together.
     """
-    if n_around is None:
-        seen = submap.covisible(submap.landmarks_of_keyframes(ids[ids >= after[0]]))[0]
-        earliest = ids[max(int(np.searchsorted(ids, before[0])) - N_AROUND, 0)]
-        n_around = len(ids) if (seen < earliest).any() else N_AROUND
-    return ask_scale(submap, [(before, after)], n_around)
+    seen = submap.covisible(submap.landmarks_of_keyframes(ids[ids >= after[0]]))[0]
+    earliest = ids[max(int(np.searchsorted(ids, before[0])) - N_AROUND, 0)]
+    return ask_scale(submap, [(before, after)], len(ids) if (seen < earliest).any() else N_AROUND)
 
 
 def count_ties(submap: Submap, ids: IntArray, end: int, begin: int, n_views: int = 1) -> int:

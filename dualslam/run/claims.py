@@ -6,20 +6,19 @@ or posed again later. A frame claims what the keyframe does that it hangs on.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from dualslam.core.geometry import se3
 from dualslam.core.noise_model import GROUP
 from dualslam.core.types import FloatArray
-from dualslam.linking.scale_observability import answer_scale, ask_scale
+from dualslam.linking.scale_observability import scale_sigmas_in_all
 from dualslam.map.landmark_views import landmark_covariances, noise_excess, resection_covariance
 from dualslam.map.submap import Submap
-from dualslam.recovery.scale_watch import SCALE_INFLATION
 
 POSITION_INFLATION = 1.1
-"""As `SCALE_INFLATION` (`recovery/scale_watch.py`), for positions."""
+"""As `SCALE_INFLATION` (`linking/scale_observability.py`), for positions."""
 NEAR = 2
 """Keyframes before and after by whose residuals, too, a position is judged: it is one against what they hold. The first
 after a blurred stretch see sharply what the blurred ones have placed."""
@@ -40,7 +39,7 @@ def claims_of(submap: Submap) -> dict[int, Claim]:
     """Return what a submap claims of its keyframes."""
     excess = noise_excess(submap)
     ids = sorted(submap.keyframes)
-    scale, covariances = _scale_sigmas(submap, excess), landmark_covariances(submap, np.arange(len(submap.landmarks)))
+    scale, covariances = _scale_sigmas(submap), landmark_covariances(submap, np.arange(len(submap.landmarks)))
     claims = {}
     for n, k in enumerate(ids):
         near = max(excess[other] for other in ids[max(n - NEAR, 0) : n + NEAR + 1])
@@ -62,19 +61,10 @@ def _position_sigma(submap: Submap, keyframe_id: int, covariances: FloatArray) -
     return POSITION_INFLATION * float(np.sqrt(max(variance, 0.0)) / np.median(depth[depth > 0]))
 
 
-def _scale_sigmas(submap: Submap, excess: dict[int, float]) -> dict[int, float]:
-    """Ask for each group of keyframes how well its scale is known against that of the whole map.
-
-    Each observation is as noisy as its keyframe's residuals say.
-    """
+def _scale_sigmas(submap: Submap) -> dict[int, float]:
+    """Ask for each group of keyframes how well its scale is known against that of the whole map."""
     ids = np.array(sorted(submap.keyframes), np.int64)
     groups = [ids[begin : begin + GROUP] for begin in range(0, len(ids), GROUP)]
-    question = ask_scale(submap, [(group, ids) for group in groups], n_around=0)
-    noise = np.array([excess[k] for k in question.ids.tolist()])[question.kf]
-    sigmas = answer_scale(replace(question, sigma_px=noise * question.sigma_px))
     can_tell = len(groups) > 1 and bool(submap.landmarks["alive"].any())
-    return {
-        k: SCALE_INFLATION * sigma if can_tell else float("nan")
-        for group, sigma in zip(groups, sigmas, strict=True)
-        for k in group.tolist()
-    }
+    sigmas = scale_sigmas_in_all(submap, [(group, ids) for group in groups]) if can_tell else [np.nan] * len(groups)
+    return {k: sigma for group, sigma in zip(groups, sigmas, strict=True) for k in group.tolist()}
