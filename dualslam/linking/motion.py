@@ -56,6 +56,7 @@ class Motion:
     change_mu: float = 0.0
     """Error that the change of velocity across the gap explains. The change may have come at any moment between the
     middles of the two windows that measured the velocities."""
+    across_mu: float = 0.0  # part of `off_mu` in directions into which that change displaces nothing
     slack_mu: float = 0.0  # what the join of two maps leaves open there
 
     @property
@@ -63,7 +64,9 @@ class Motion:
         """Return how far off the prediction may be: any way, where it could be asked at too few places."""
         if self.n_asked < MIN_ASKED:
             return math.inf
-        return max(ALLOWED * self.usual_mu, self.change_mu) + self.slack_mu
+        usual_mu = ALLOWED * self.usual_mu
+        explains = self.across_mu <= usual_mu + self.slack_mu
+        return max(usual_mu, self.change_mu if explains else 0.0) + self.slack_mu
 
     @property
     def is_refused(self) -> bool:
@@ -155,17 +158,28 @@ def _measure(fits: _Fits, last_before: int, known: _Fits, slack_mu: float = 0.0)
         return None
     weights = has[0] / sum(has), has[1] / sum(has)
     apart_s = float(fits.times_s[j] - fits.times_s[i])
-    change, may_halt = 0.0, 1.0
+    velocities, may_halt = (fits.before.velocity[i], fits.after.velocity[j]), 1.0
     if all(has):
-        difference, mean = (
-            float(np.linalg.norm(fits.before.velocity[i] + sign * fits.after.velocity[j])) for sign in (-1.0, 1.0)
-        )
-        change = 0.5 * difference * (apart_s + fits.reach_s)
+        difference, mean = (float(np.linalg.norm(velocities[0] + sign * velocities[1])) for sign in (-1.0, 1.0))
         may_halt = min(1.0, difference / max(mean, 1e-300))
     usual, n_asked, asked_s = _usual_error(known, apart_s, *weights)
     # A camera that goes on at the speed that it had has hardly stood still: it may rather be at a similar place.
     off = fits.error_of_a_halt(i, j, *weights, may_halt * (apart_s - asked_s))
-    return Motion(off, usual, n_asked, sum(has), change, slack_mu)
+    change, across = _explained(off, *velocities, apart_s + fits.reach_s) if all(has) else (0.0, 0.0)
+    return Motion(float(np.linalg.norm(off)), usual, n_asked, sum(has), change, across, slack_mu)
+
+
+def _explained(off: FloatArray, before: FloatArray, after: FloatArray, over_s: float) -> tuple[float, float]:
+    """Return how far a change of velocity displaces a camera at most, and the part of an error that it leaves.
+
+    It displaces along the change. A camera that turns goes further, too, than the mean of its velocities leads.
+    """
+    change = after - before
+    along = change / max(float(np.linalg.norm(change)), 1e-300)
+    speeds, mean = (float(np.linalg.norm(v)) for v in (before, after)), 0.5 * (before + after)
+    further = (0.5 * sum(speeds) - float(np.linalg.norm(mean))) * over_s
+    across = float(np.linalg.norm(off - (off @ along) * along))
+    return 0.5 * float(np.linalg.norm(change)) * over_s, max(across - further, 0.0)
 
 
 def _usual_error(known: _Fits, apart_s: float, of_before: float, of_after: float) -> tuple[float, int, float]:
@@ -232,13 +246,13 @@ class _Fits:
         moved = self.after.place[j] - self.before.place[i]
         return np.asarray(np.linalg.norm(moved - velocity * (self.times_s[j] - self.times_s[i])[:, None], axis=1))
 
-    def error_of_a_halt(self, i: int, j: int, of_before: float, of_after: float, halt_s: float) -> float:
-        """Return `errors` of one pair of frames, where the camera may have stood still for up to `halt_s` between."""
+    def error_of_a_halt(self, i: int, j: int, of_before: float, of_after: float, halt_s: float) -> FloatArray:
+        """Return the error (3,) of one pair of frames, where the camera may have stood still for up to `halt_s`."""
         apart_s = float(self.times_s[j] - self.times_s[i])
         velocity = of_before * self.before.velocity[i] + of_after * self.after.velocity[j]
         moved = self.after.place[j] - self.before.place[i]
         moving_s = float(moved @ velocity) / max(float(velocity @ velocity), 1e-300)
-        return float(np.linalg.norm(moved - velocity * np.clip(moving_s, apart_s - halt_s, apart_s)))
+        return np.asarray(moved - velocity * np.clip(moving_s, apart_s - halt_s, apart_s), np.float64)
 
     def stretches(self, apart_s: float, needs_before: bool, needs_after: bool) -> tuple[IntArray, IntArray]:
         """Return the pairs of frames so far apart in time over which the camera was tracked without a jump."""

@@ -131,6 +131,30 @@ def test_a_change_of_velocity_explains_what_it_can() -> None:
 
 
 @pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize(("across_m", "refused"), [(0.0, False), (0.3, True), (-0.3, True)])
+def test_a_change_of_velocity_displaces_along_itself(seed: int, across_m: float, refused: bool) -> None:
+    """A map that was found again at a similar place, and is bent there, excuses no error by its own velocity."""
+    t, p = way(140, seed, sway_m=0.002)
+    v, changed = np.array([0.8, 0.0, 0.3]), np.array([0.3, 0.0, -0.2])
+    t, p = without(t, p, 100, 12)
+    p[100:] = p[99] + 0.5 * (t[100] - t[99]) * (v + changed) + np.outer(t[100:] - t[100], changed)
+    p[100:] += across_m * np.array([0.0, 1.0, 0.0])
+    assert motion_behind(path_of(t, p), 99).is_refused is refused
+
+
+@pytest.mark.parametrize("gap_s", [0.5, 1.0, 2.0, 4.0])
+@pytest.mark.parametrize("turn_deg", [45.0, 90.0, 180.0])
+def test_a_camera_may_turn_unseen(gap_s: float, turn_deg: float) -> None:
+    """A car that has gone straight on takes a bend within the gap."""
+    length = round(RATE_HZ * gap_s)
+    heading = np.radians(np.interp(np.arange(180 + length), [100, 100 + length], [0.0, turn_deg]))
+    steps = np.column_stack([np.cos(heading), np.zeros(len(heading)), np.sin(heading)]) / RATE_HZ
+    p = np.cumsum(steps, axis=0) + np.random.default_rng(1).normal(0, 1e-3, steps.shape)
+    t, p = without(np.arange(len(p)) / RATE_HZ, p, 100, length)
+    assert not motion_behind(path_of(t, p), 99).is_refused
+
+
+@pytest.mark.parametrize("seed", range(4))
 def test_a_camera_may_halt_for_as_long_as_it_was_not_watched(seed: int) -> None:
     """A robot at constant speed stops dead while nothing is seen, and goes on slowly.
 
