@@ -112,14 +112,18 @@ class PatchAlignment:
 
     def _move(self, submap: Submap, pairs: _Pairs, shift_px: FloatArray) -> None:
         """Move features in the images of their keyframes."""
-        camera = self._camera()
-        for k in np.unique(pairs.kf).tolist():
-            of = pairs.kf == k
+        n, uv_px = len(pairs.kf), np.zeros((len(pairs.kf), 2))
+        keyframes = {k: np.flatnonzero(pairs.kf == k) for k in np.unique(pairs.kf).tolist()}
+        for k, of in keyframes.items():
+            uv_px[of] = submap.keyframes[k].features.uv_px[pairs.feature[of]]
+        # One call for all: taking a lens out costs more by the call than by the pixel.
+        uv_rect_px, _ = self._camera().rectify(np.concatenate([uv_px, uv_px + shift_px]))
+        for k, of in keyframes.items():
             keyframe, at = submap.keyframes[k], pairs.feature[of]
             features = keyframe.features
             uv, uv_rect = features.uv_px.copy(), features.uv_rect_px.copy()
             uv[at] += shift_px[of]
-            uv_rect[at] += camera.rectify(uv[at])[0] - camera.rectify(features.uv_px[at])[0]
+            uv_rect[at] += uv_rect_px[n + of] - uv_rect_px[of]
             submap.keyframes[k] = replace(keyframe, features=replace(features, uv_px=uv, uv_rect_px=uv_rect))
             if k in self._patches:
                 self._patches[k].forget(at)
