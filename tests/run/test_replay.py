@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import json
-from itertools import pairwise
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 
 from dualslam.build import build_system
@@ -79,8 +80,9 @@ def test_a_run_is_repeated_to_the_bit_and_another_source_comes_apart(
     assert "the same trajectory, bit for bit" in capsys.readouterr().out
     assert (run / "trajectory.txt").read_bytes() == (tmp_path / "again" / "trajectory.txt").read_bytes()
     images = sorted((source / "images").iterdir())
-    for image, later in pairwise(images[10:21]):
-        image.write_bytes(later.read_bytes())
+    blank = np.zeros_like(cv2.imread(str(images[0])))
+    for image in images[12:18]:
+        cv2.imwrite(str(image), blank)
     main(["run", str(source), "--replay", str(run), "--out", str(tmp_path / "other")])
     told = capsys.readouterr()
     assert "another trajectory; it comes apart at frame" in told.out
