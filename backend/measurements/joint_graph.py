@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import groupby
+from itertools import groupby, pairwise
 from typing import Self
 
 import gtsam
@@ -140,17 +140,15 @@ class JointGraph:
             wrong = self._ratios() > 1
             cost = 2.0 * float(graph.error(self.values)) + float(wrong.sum()) * CHI2_99[3] + price
             is_plain = bool(self._excess(graph) <= QUANTILE_99 and wrong.mean() <= FEW_REJECTED)
-            trials.append(_Trial(cost, drift, self._weights(), self.values, is_plain))
+            trials.append(_Trial(cost, drift, (~wrong).astype(float), self.values, is_plain))
             if (trials[0].weights > 0.5).all():
                 break
         return min(trials, key=lambda trial: trial.cost)
 
     def rebate(self) -> float:
-        """Return what neighbours that are outvoted cost too much: a burst of them is one event."""
-        wrong = self._weights() < 0.5
-        dims = np.array([len(t.reading.sigmas) for t in self.terms] + [7] * len(self.doubtful))
-        goes_on = wrong & np.append(False, wrong[:-1])
-        return float(np.maximum(CHI2_99[3] - dims[goes_on], 0.0).sum())
+        """Return what neighbouring positions that are outvoted cost too much: a burst of them is one event."""
+        wrong = [t.weight < 0.5 and t.reading.kind == POSITION for t in self.terms]
+        return float((CHI2_99[3] - 3) * sum(here and before for before, here in pairwise(wrong)))
 
     def _take(self, trial: _Trial) -> None:
         self.drift, self.values = trial.drift, trial.values

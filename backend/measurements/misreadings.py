@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
+from dualslam.backend.measurements.base import Mount
+from dualslam.backend.measurements.rotation_rate import RotationRate
 from dualslam.backend.measurements.start import POSITION
 from dualslam.core.metric_problem import MeasurementSource
 from dualslam.core.types import FloatArray
@@ -30,10 +32,28 @@ def misreadings(sources: Sequence[MeasurementSource], jumps_s: Mapping[int, floa
             shrunk = -2.0 * n * float(np.log(abs(np.linalg.det(A))))
             if shrunk > 1:  # sigmas in metres beside lengths in feet
                 yield words, [*before, _transformed(source, A, keep_sigmas=True), *after], shrunk
+        for words, change in _TURNS.items():
+            read = [change(r) for r in source.readings]
+            if any(a is not b for a, b in zip(read, source.readings, strict=True)):
+                yield words, [*before, replace(source, readings=read), *after], 0.0
         if i in jumps_s:
             parts = [[r for r in source.readings if (r.times_s[0] >= jumps_s[i]) is late] for late in (False, True)]
             split = [replace(source, readings=part) for part in parts]
             yield f"its clock seems to jump at about {jumps_s[i]:.0f} s", [*before, *split, *after], 0.0
+
+
+def _without_mount(r: Any) -> Any:
+    return replace(r, mount=Mount()) if getattr(r, "mount", Mount()).is_given else r
+
+
+def _from_degrees(r: Any) -> Any:
+    return replace(r, turn_rad=np.radians(r.turn_rad)) if r.kind == RotationRate.kind else r
+
+
+_TURNS: Mapping[str, Callable[[Any], Any]] = {
+    "its mount contradicts the turns of the camera": _without_mount,
+    "its rates seem to be in degrees a second": _from_degrees,
+}
 
 
 def _axes(source: MeasurementSource) -> dict[str, FloatArray]:

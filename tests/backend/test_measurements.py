@@ -283,6 +283,20 @@ def test_a_gyroscope_is_turned_into_place_and_its_bias_found():
     assert rmse(errors_m(problem, solution, moving)) < 1.0
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("words", ["degrees a second", "rotation_rate contradict|mount contradicts"])
+def test_a_gyroscope_that_was_misread_is_refused_in_a_sentence(words):
+    truth = drive(300, hills=20.0)
+    gyroscope = Gyroscope(turn_rad=(0.5, -1.0, 0.3), seed=8).rates(truth)
+    rows = gyroscope.rows
+    if "mount" in words:
+        rows = [MeasurementRow("mount", (0, 0, 0, 0, 0, 0, 1), ""), *rows]
+    else:
+        rows = [replace(r, values=(r.values[0], *np.degrees(r.values[1:4]).tolist(), r.values[4])) for r in rows]
+    with pytest.raises(InputError, match=words):
+        solve(drifted(truth), Receiver(seed=1).positions(truth), replace(gyroscope, rows=rows))
+
+
 def test_a_gyroscope_alone_gives_no_scale_of_a_sure_map():
     """The map is a million times surer within than the gauge's prior: normal equations have no digits left for both."""
     truth = drive(300)
