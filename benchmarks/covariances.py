@@ -3,7 +3,7 @@
 For each kind of stretch (plain; blurred; beyond a gap; the first ten keyframes) it prints the root mean square of the
 true error over the claimed one, of positions and of the scale against that of the submap (`dualslam/run/claims.py`): 1
 is honest, more is boasting. The truth of a position is its distance from the true one after the keyframes about it have
-been aligned; that of a scale its ratio to the median of the submap. `POSITION_INFLATION` was chosen on seeds 1 to 3.
+been aligned. That of a scale is its ratio to the median of the submap. `POSITION_INFLATION` was chosen on seeds 1 to 3.
 
 With `--poses` undisturbed runs are made instead, of `--frames` frames: the NEES of each third frame's covariance
 (`FrameResult.covariance`, as soon as it is posed), and the share of these frames inside the 95 % band.
