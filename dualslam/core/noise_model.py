@@ -45,7 +45,6 @@ ROBUST_N = 5
 """Numbers whose median survives two outliers."""
 MAX_TRIES = 3
 """Times that what fails by chance is tried in vain before it counts as broken."""
-
 UNSURE_SCALE = 0.07
 """Standard deviation of the logarithm of a stretch's scale against that of its submap: with more it is off by 15 % with
 a probability above 5 %. What is off by so much is too large or too small to be measured in."""

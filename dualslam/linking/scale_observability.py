@@ -9,7 +9,7 @@ points. That ratio does not depend on the gauge.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -22,7 +22,6 @@ from dualslam.core.noise_model import GROUP
 from dualslam.core.sums import sum_by
 from dualslam.core.types import FloatArray, IntArray
 from dualslam.linking.gates import PIXEL_CHI2
-from dualslam.map.landmark_views import noise_excess
 from dualslam.map.submap import Submap
 
 N_AROUND = 2 * GROUP
@@ -52,12 +51,16 @@ def scale_sigma_between(submap: Submap, here: IntArray, there: IntArray) -> floa
     return answer_scale(ask_scale(submap, [(here, there)]))[0]
 
 
-def scale_sigmas_in_all(submap: Submap, places: Sequence[tuple[IntArray, IntArray]]) -> list[float]:
+def scale_sigmas_in_all(
+    submap: Submap, places: Sequence[tuple[IntArray, IntArray]], excess: Mapping[int, float]
+) -> list[float]:
     """Return the standard deviation of the log of the scale between pairs of places, by all that a submap has seen.
 
     Each observation is as noisy as its keyframe's residuals say, and neighbours' errors are alike.
+
+    `excess`: of `noise_excess`.
     """
-    question, excess = ask_scale(submap, places, n_around=len(submap.keyframes)), noise_excess(submap)
+    question = ask_scale(submap, places, n_around=len(submap.keyframes))
     noise = np.array([excess[k] for k in question.ids.tolist()])[question.kf]
     sigmas = answer_scale(replace(question, sigma_px=noise * question.sigma_px))
     return [SCALE_INFLATION * sigma for sigma in sigmas]
@@ -87,7 +90,7 @@ def ask_scale(submap: Submap, places: Sequence[tuple[IntArray, IntArray]], n_aro
     """
     held = np.array(sorted(submap.keyframes), np.int64)
     pairs = [(here[np.isin(here, held)], there[np.isin(there, held)]) for here, there in places]
-    asked = np.concatenate([held[:0], *(ids for pair in pairs for ids in pair)])
+    asked = np.concatenate([ids for pair in pairs for ids in pair])
     ids = held[:0]
     if len(asked):
         first, last = np.searchsorted(held, [asked.min(), asked.max()])

@@ -22,6 +22,7 @@ from dualslam.core.events import EventKind
 from dualslam.core.noise_model import GROUP
 from dualslam.core.types import BoolArray, IntArray
 from dualslam.linking.scale_observability import scale_sigmas_in_all
+from dualslam.map.landmark_views import noise_excess
 from dualslam.map.split import submap_of
 from dualslam.map.submap import Submap
 from dualslam.recovery.scale_watch import FIRM_TIES, count_ties, lost_from
@@ -68,7 +69,9 @@ def _outermost_loss(
         for link in links
         for begin in range(link + 1, len(outward), GROUP)
     ]
-    sigmas = iter(scale_sigmas_in_all(submap, places))
+    if not places:
+        return outward[:0], 0.0
+    sigmas = iter(scale_sigmas_in_all(submap, places, noise_excess(submap)))
     for link in links:
         begins = np.arange(link + 1, len(outward), GROUP)
         sigma = np.array([next(sigmas) for _ in begins])

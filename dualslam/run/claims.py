@@ -39,7 +39,7 @@ def claims_of(submap: Submap) -> dict[int, Claim]:
     """Return what a submap claims of its keyframes."""
     excess = noise_excess(submap)
     ids = sorted(submap.keyframes)
-    scale, covariances = _scale_sigmas(submap), landmark_covariances(submap, np.arange(len(submap.landmarks)))
+    scale, covariances = _scale_sigmas(submap, excess), landmark_covariances(submap, np.arange(len(submap.landmarks)))
     claims = {}
     for n, k in enumerate(ids):
         near = max(excess[other] for other in ids[max(n - NEAR, 0) : n + NEAR + 1])
@@ -61,10 +61,11 @@ def _position_sigma(submap: Submap, keyframe_id: int, covariances: FloatArray) -
     return POSITION_INFLATION * float(np.sqrt(max(variance, 0.0)) / np.median(depth[depth > 0]))
 
 
-def _scale_sigmas(submap: Submap) -> dict[int, float]:
+def _scale_sigmas(submap: Submap, excess: dict[int, float]) -> dict[int, float]:
     """Ask for each group of keyframes how well its scale is known against that of the whole map."""
     ids = np.array(sorted(submap.keyframes), np.int64)
     groups = [ids[begin : begin + GROUP] for begin in range(0, len(ids), GROUP)]
     can_tell = len(groups) > 1 and bool(submap.landmarks["alive"].any())
-    sigmas = scale_sigmas_in_all(submap, [(group, ids) for group in groups]) if can_tell else [np.nan] * len(groups)
+    places = [(group, ids) for group in groups]
+    sigmas = scale_sigmas_in_all(submap, places, excess) if can_tell else [np.nan] * len(groups)
     return {k: sigma for group, sigma in zip(groups, sigmas, strict=True) for k in group.tolist()}
