@@ -45,12 +45,8 @@ LEAST_REDUNDANCY = 1e-6
 class GtsamAtlasSolver:
     """The `dualslam.core.atlas_problem.AtlasSolver` made with GTSAM.
 
-    Parameters
-    ----------
-    robust : bool
-        Let graduated non-convexity choose among doubtful connections; else all are obeyed.
-    robust_k : float
-        Huber threshold of the submaps' projections, in sigmas.
+    - `robust`: let graduated non-convexity choose among doubtful connections; else all are obeyed.
+    - `robust_k`: huber threshold of the submaps' projections, in sigmas.
     """
 
     def __init__(self, robust: bool, robust_k: float) -> None:
@@ -60,9 +56,7 @@ class GtsamAtlasSolver:
     def solve(self, problem: AtlasProblem) -> AtlasSolution:
         """Find the similarities that agree best with the edges, without those that are wrong.
 
-        Raises
-        ------
-        SolverError
+        Raises `SolverError`.
         """
         graph = _Graph(problem)
         doubtful = np.array([e.doubtful for e in problem.edges], bool)
@@ -78,9 +72,7 @@ class GtsamAtlasSolver:
     def relative_covariances(self, problem: AtlasProblem, first: int) -> FloatArray:
         """Return (N, 7, 7) covariances of ``inv(S_world_first) @ S_world_node``, all edges believed; 0 at the first.
 
-        Raises
-        ------
-        SolverError
+        Raises `SolverError`.
         """
         graph = _Graph(problem)
         everything = np.ones(len(problem.edges), bool)
@@ -100,9 +92,7 @@ class GtsamAtlasSolver:
 
         `held`: keyframes whose relative pose is no evidence.
 
-        Raises
-        ------
-        SolverError
+        Raises `SolverError`.
         """
         return edge_covariances(submap, pairs, self._robust_k, held)
 

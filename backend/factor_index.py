@@ -60,15 +60,10 @@ class Plan:
 class FactorIndex:
     """Row by row, what becomes of each observation; it grows with the submap's table, and shrinks with it.
 
-    Attributes
-    ----------
-    rows : Table
-        ``admitted`` (whether the graph can bear it), ``factor`` (index in the solver, or `OUTSIDE`), ``uv_px`` (2),
-        ``sigma_px``: one row per observation row. Pixels never change, so they are looked up once.
-    keyframes : set of int
-        Those whose pose is in the graph.
-    banned : set of int
-        Landmarks that made the solver fail. They stay out until they are observed again.
+    - `rows`: ``admitted`` (whether the graph can bear it), ``factor`` (index in the solver, or `OUTSIDE`), ``uv_px``
+      (2), ``sigma_px``: one row per observation row. Pixels never change, so they are looked up once.
+    - `keyframes`: those whose pose is in the graph.
+    - `banned`: landmarks that made the solver fail. They stay out until they are observed again.
     """
 
     def __init__(self, config: GraphConfig) -> None:

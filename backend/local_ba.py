@@ -22,16 +22,10 @@ MAX_DEPTH_SIGMA = 1.0
 class SubmapBundle:
     """A `BundleResult` in a submap's ids: ``submap.apply_estimate(*bundle.estimate)`` takes it over.
 
-    Attributes
-    ----------
-    keyframe_ids : (F,) int64
-        The free ones first.
-    landmark_ids : (P,) int64
-    rows : (R,) int64
-        Rows of the submap's observation table, as in ``result.chi2``.
-    result : BundleResult
-    T_submap_frame : (G, 4, 4) float64
-        Poses of the frames that took part.
+    - `keyframe_ids` (F,) int64: the free ones first.
+    - `landmark_ids` (P,) int64.
+    - `rows` (R,) int64: rows of the submap's observation table, as in ``result.chi2``.
+    - `T_submap_frame` (G, 4, 4) float64: poses of the frames that took part.
     """
 
     keyframe_ids: IntArray

@@ -45,13 +45,8 @@ def reproject(
 ) -> tuple[FloatArray, BoolArray, FloatArray]:
     """Project R points, each by a pose of its own; arguments as in `compute_residuals`.
 
-    Returns
-    -------
-    xyz_cam : (R, 3) float64
-    front : (R,) bool
-        Whether the point is in front of the camera.
-    uv_px : (R, 2) float64
-        The pixel; that of the optical axis where it is not.
+    Returns the points in the cameras (R, 3), which of them are in front (R,), and their pixels (R, 2): that of the
+    optical axis for those behind.
     """
     # Coordinate by coordinate, each an array of its own: half the time of (R, 3, 3) by (R, 3).
     of = T_submap_kf[:, :3].transpose(2, 1, 0).reshape(12, -1).take(pose, axis=1).reshape(4, 3, -1)  # column, row

@@ -33,16 +33,10 @@ took nearly twice as long (1,070 nodes, 150 doubtful edges, 50 of them false), a
 class Sim3Edge:
     """A measured similarity between two nodes.
 
-    Attributes
-    ----------
-    first, second : int
-    S_first_second : (4, 4)
-        ``[[s R, t], [0, 1]]``, takes coordinates in the second node to the first.
-    covariance : (7, 7)
-        Of the right perturbation ``S_first_second @ exp(xi)``, order rotation, translation, log-scale: in the second
-        node's frame and unit.
-    doubtful : bool
-        Where true, robust optimisation may refuse the edge.
+    - `S_first_second` (4, 4): ``[[s R, t], [0, 1]]``, takes coordinates in the second node to the first.
+    - `covariance` (7, 7): of the right perturbation ``S_first_second @ exp(xi)``, order rotation, translation,
+      log-scale: in the second node's frame and unit.
+    - `doubtful`: where true, robust optimisation may refuse the edge.
     """
 
     first: int
@@ -64,13 +58,9 @@ class Sim3Prior:
 class Sim3Solution:
     """The optimum of a graph over Sim(3).
 
-    Attributes
-    ----------
-    S_world_node : dict of int to (4, 4)
-    inliers : (E,) bool
-        False for the doubtful edges that were refused.
-    cost_before, cost_after : float
-        Half the sum of squared whitened residuals of the edges that were kept.
+    - `S_world_node` dict of int to (4, 4).
+    - `inliers` (E,) bool: false for the doubtful edges that were refused.
+    - `cost_before`, `cost_after`: half the sum of squared whitened residuals of the edges that were kept.
     """
 
     S_world_node: dict[int, FloatArray]
@@ -83,10 +73,7 @@ class Sim3Solution:
     def covariances(self, nodes: Sequence[int]) -> FloatArray:
         """Return (N, 7, 7) marginal covariances of ``S_world_node`` (right perturbation; in each node's own frame).
 
-        Raises
-        ------
-        SolverError
-            If the solver cannot tell.
+        Raises `SolverError` if the solver cannot tell.
         """
         try:
             marginals = gtsam.Marginals(self._graph, self._values)
@@ -98,10 +85,7 @@ class Sim3Solution:
     def relative_covariances(self, pairs: Sequence[tuple[int, int]]) -> FloatArray:
         """Return (P, 7, 7) covariances of ``inv(S_world_first) @ S_world_second``: right perturbation, second's frame.
 
-        Raises
-        ------
-        SolverError
-            If the solver cannot tell.
+        Raises `SolverError` if the solver cannot tell.
         """
         found = np.empty((len(pairs), 7, 7))
         try:

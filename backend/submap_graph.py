@@ -83,12 +83,6 @@ class _Optimum:
 class ISam2SubmapGraph:
     """The `dualslam.core.interfaces.SubmapGraph` made with GTSAM's iSAM2.
 
-    Parameters
-    ----------
-    config : GraphConfig
-
-    Notes
-    -----
     Reading was measured at 400 keyframes and 10,000 landmarks (CPU time, best case): the variables of 20 keyframes by
     their keys 0.25 ms, all of them 3.5 ms, the fit of 5,000 observations 1.2 ms. Half of the 3.5 ms is the solver's,
     half the copy into numpy. `update` therefore reads `READ_WINDOW` keyframes and the landmarks that they see, and
@@ -115,10 +109,7 @@ class ISam2SubmapGraph:
         Some calls make the graph anew: the first, one after a change of the submap's gauge (`Submap.transform`), and
         one after its rows were renumbered without the graph's knowledge.
 
-        Raises
-        ------
-        SolverError
-            If the solver failed and the graph could not be made anew either.
+        Raises `SolverError` if the solver failed and the graph could not be made anew either.
         """
         start = time.thread_time()
         if self._solver is None:
@@ -146,16 +137,9 @@ class ISam2SubmapGraph:
     def rebuild(self, submap: Submap, near_optimum: bool = False) -> GraphEstimate:
         """Make the graph anew from the submap's arrays (batch optimum seeds a fresh iSAM2); returns everything.
 
-        Parameters
-        ----------
-        submap : Submap
-        near_optimum : bool
-            Whether its parts are solved already, so that few iterations are enough.
+        - `near_optimum`: whether its parts are solved already, so that few iterations are enough.
 
-        Raises
-        ------
-        SolverError
-            If that cannot be done.
+        Raises `SolverError` if that cannot be done.
         """
         iterations = MERGE_ITERATIONS if near_optimum else self._rebuild_iterations
         return self._remake(submap, time.thread_time(), True, iterations, with_all=True)
@@ -172,10 +156,7 @@ class ISam2SubmapGraph:
     def pose_covariance(self, keyframe_id: int) -> FloatArray:
         """Return the (6, 6) marginal covariance of `T_submap_kf` (rotation, translation; in the keyframe's frame).
 
-        Raises
-        ------
-        SolverError
-            If the keyframe is not in the graph, or the solver cannot tell.
+        Raises `SolverError` if the keyframe is not in the graph, or the solver cannot tell.
         """
         if self._solver is None or keyframe_id not in self._factor_index.keyframes:
             raise SolverError(f"keyframe {keyframe_id} is not in the graph: update it with the keyframe's submap first")
@@ -187,15 +168,9 @@ class ISam2SubmapGraph:
     def point_covariances(self, landmark_ids: IntArray) -> FloatArray:
         """Return (L, 3, 3) marginal covariances of landmarks, in the submap's frame; NaN for those not in the graph.
 
-        Parameters
-        ----------
-        landmark_ids : (L,) int64
-            One below 0 is none, as in `Submap.landmark_of`: NaN.
+        - `landmark_ids` (L,) int64: one below 0 is none, as in `Submap.landmark_of`: NaN.
 
-        Raises
-        ------
-        SolverError
-            If the solver cannot tell.
+        Raises `SolverError` if the solver cannot tell.
         """
         ids = np.asarray(landmark_ids, np.int64)
         covariances = np.full((len(ids), 3, 3), np.nan)
@@ -216,10 +191,7 @@ class ISam2SubmapGraph:
         That of the views of a point, the poses held, and that of the pose of the newest of them, with which the point
         moves. Points that are variables have theirs from `point_covariances`.
 
-        Raises
-        ------
-        SolverError
-            If the solver cannot tell a pose's.
+        Raises `SolverError` if the solver cannot tell a pose's.
         """
         return triangulated_covariances(submap, landmark_ids, self._factor_index.rows, self.pose_covariance)
 
@@ -241,10 +213,7 @@ class ISam2SubmapGraph:
     def bayes_tree(self) -> BayesTree:
         """Return the incremental solver's current Bayes tree.
 
-        Raises
-        ------
-        SolverError
-            If nothing has been solved yet.
+        Raises `SolverError` if nothing has been solved yet.
         """
         try:
             if self._solver is not None:

@@ -173,13 +173,8 @@ class TieChanges:
 class Ties:
     """The gauge, holds and relative poses in a graph, with the indices of their factors.
 
-    Attributes
-    ----------
-    gauge : Gauge or None
-    forced : set of int
-        Keyframes that are held whatever ties them. They stay when the graph is made anew.
-    holds : dict of int to int
-        Factors of the keyframes that are held by a loose prior.
+    - `forced`: keyframes that are held whatever ties them. They stay when the graph is made anew.
+    - `holds`: factors of the keyframes that are held by a loose prior.
     """
 
     def __init__(self) -> None:

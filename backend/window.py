@@ -63,10 +63,7 @@ class _State:
 class NumpyWindowSolver:
     """The `dualslam.core.interfaces.WindowSolver` in numpy.
 
-    Parameters
-    ----------
-    robust_k : float
-        Huber threshold in sigmas.
+    - `robust_k`: huber threshold in sigmas.
     """
 
     def __init__(self, robust_k: float) -> None:

@@ -62,13 +62,8 @@ def choose_frontend(frames: Iterable[Frame], corners: Candidate, blobs: Candidat
     Blobs cost several times the CPU. They are chosen where images show few corners and blobs are the first to start a
     map. They are chosen as well where steps are so wide that few corners are found again.
 
-    Parameters
-    ----------
-    frames : iterable of Frame
-        From the first one on; as many are read as the choice needs.
-    corners, blobs : Candidate
-    n_features : int
-        Corners that are asked for.
+    - `frames`: from the first one on; as many are read as the choice needs.
+    - `n_features`: corners that are asked for.
     """
     coming = _until_an_error(frames)
     first = list(islice(coming, LOOKED_AT))

@@ -87,12 +87,8 @@ class StillPixels:
 
     `size_px` (width, height).
 
-    Attributes
-    ----------
-    hidden : (H, W) bool or None
-        Pixels that stand still; None while none are found. A new array whenever it changes.
-    camera_stands : bool
-        Whether most of the image stands still, and something moves through it.
+    - `hidden` (H, W) bool or None: pixels that stand still; None while none are found. A new array whenever it changes.
+    - `camera_stands`: whether most of the image stands still, and something moves through it.
     """
 
     def __init__(self, size_px: tuple[int, int]) -> None:

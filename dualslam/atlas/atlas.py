@@ -87,17 +87,9 @@ class Link:
     ) -> Link:
         """Make the link of a similarity that was measured between two keyframes.
 
-        Parameters
-        ----------
-        atlas : Atlas
-        a, b : (int, int)
-            Submap and keyframe.
-        S_ka_kb : (4, 4)
-            From the second keyframe's frame to the first one's, in the units of their submaps.
-        covariance : (7, 7)
-            Of ``S_ka_kb @ exp(xi)``: in the second keyframe's frame.
-        kind : LinkKind
-        doubtful : bool
+        - `a`, `b` (int, int): submap and keyframe.
+        - `S_ka_kb` (4, 4): from the second keyframe's frame to the first one's, in the units of their submaps.
+        - `covariance` (7, 7): of ``S_ka_kb @ exp(xi)``: in the second keyframe's frame.
         """
         T_a, T_b = atlas.submaps[a[0]].T_submap_kf[a[1]], atlas.submaps[b[0]].T_submap_kf[b[1]]
         Ad = sim3.adjoint(T_b)
@@ -177,10 +169,7 @@ class Atlas:
     def S_world_submap(self, component: list[int]) -> dict[int, FloatArray]:
         """Return the transform of each submap of a linked set into the frame of its first one.
 
-        Parameters
-        ----------
-        component : list of int
-            Submap ids; links that lead out of it are not followed.
+        - `component`: submap ids; links that lead out of it are not followed.
         """
         found: dict[int, FloatArray] = {component[0]: np.eye(4)}
         if component[0] in self.placement:

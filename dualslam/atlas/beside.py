@@ -35,12 +35,8 @@ class AtlasProblems:
 
     `desk`: where covariances are computed that a problem to come will need.
 
-    Attributes
-    ----------
-    covariances : EdgeCovariances
-        What the submaps say of their own edges.
-    views : NodeViews
-        What their nodes see.
+    - `covariances`: what the submaps say of their own edges.
+    - `views`: what their nodes see.
     """
 
     def __init__(self, record: Record, solver: AtlasSolver, desk: Desk) -> None:

@@ -131,12 +131,8 @@ class Worlds:
     def of(self, submap_id: int) -> tuple[FloatArray, int]:
         """Return where a submap lies in its world, and whose frame that is.
 
-        Returns
-        -------
-        (4, 4) float64
-            ``S_world_submap``, as it is known now.
-        int
-            The submap whose frame and unit the world has: the first of its linked set, or the saved map's.
+        Returns the current ``S_world_submap`` (4, 4), and the submap whose frame and unit the world has: the first of
+        its linked set, or the saved map's.
         """
         self._compose()
         return self._found[submap_id]

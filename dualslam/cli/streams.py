@@ -16,10 +16,7 @@ STDERR = 2
 class Lenient:
     """A text stream that drops what cannot be written, once its reader has gone or its disk is full.
 
-    Attributes
-    ----------
-    problem : OSError or None
-        What was wrong first.
+    - `problem`: what was wrong first.
     """
 
     def __init__(self, stream: TextIO) -> None:

@@ -95,10 +95,7 @@ class Decision:
 class DecisionSink:
     """Passes decisions on to the listener, if there is one.
 
-    Attributes
-    ----------
-    write : callable or None
-        Called with each decision. None: decisions are not wanted, and are not made up either.
+    - `write`: called with each decision. None: decisions are not wanted, and are not made up either.
     """
 
     def __init__(self) -> None:

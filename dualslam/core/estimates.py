@@ -17,20 +17,14 @@ if TYPE_CHECKING:
 class GraphEstimate:
     """Result of a solved graph for its submap: refined variables, and how well the newest factors fit.
 
-    Attributes
-    ----------
-    keyframe_ids : (K,) int64, T_submap_kf : (K, 4, 4)
-    landmark_ids : (L,) int64, xyz_mu : (L, 3)
-    outlier_rows : (R,) int64
-        Rows of the submap's observation table whose residual is beyond the graph's chi-square gate.
-    chi2_newest : float
-        Mean squared whitened residual per degree of freedom of the factors added last (1 is expected).
-    noise2 : float
-        Variance that the whitened residuals have (1 where the pixels' sigmas are right): what gates go by.
-    rebuilt : bool
-        True where the solver threw and the graph was made anew from the submap's arrays.
-    seconds : float
-        CPU time of the calling thread.
+    - `keyframe_ids` (K,), `T_submap_kf` (K, 4, 4).
+    - `landmark_ids` (L,), `xyz_mu` (L, 3).
+    - `outlier_rows` (R,) int64: rows of the submap's observation table whose residual is beyond the graph's chi-square
+      gate.
+    - `chi2_newest`: mean squared whitened residual per degree of freedom of the factors added last (1 is expected).
+    - `noise2`: variance that the whitened residuals have (1 where the pixels' sigmas are right): what gates go by.
+    - `rebuilt`: true where the solver threw and the graph was made anew from the submap's arrays.
+    - `seconds`: CPU time of the calling thread.
     """
 
     keyframe_ids: IntArray
@@ -57,26 +51,15 @@ MAX_PRIOR_SIGMAS = 6.0
 class CalibrationEstimate:
     """A camera as estimated from a submap's observations.
 
-    Attributes
-    ----------
-    correction : LensCorrection
-        Of the calibration that was given.
-    covariance : (5, 5)
-        Of ``correction.vector``, inflated for the correlation of neighbouring observations.
-    distance2 : float
-        Squared Mahalanobis distance from the correction that the submap was made with, whose covariance counts too
-        where it was estimated.
-    accepted : bool
-        Whether it is significantly better than that.
-    cost_before, cost_after : float
-        Sum of the Huber losses; before: poses and points as they were.
-    n_keyframes, n_observations : int
-    seconds : float
-    prior_sigmas : float
-        The largest part of the correction, in standard deviations of its prior.
-    path_change : float
-        RMS distance by which keyframes would move with the correction, over the length of their path. Zero where the
-        correction may be chance.
+    - `correction`: of the calibration that was given.
+    - `covariance` (5, 5): of ``correction.vector``, inflated for the correlation of neighbouring observations.
+    - `distance2`: squared Mahalanobis distance from the correction that the submap was made with, whose covariance
+      counts too where it was estimated.
+    - `accepted`: whether it is significantly better than that.
+    - `cost_before`, `cost_after`: sum of the Huber losses; before: poses and points as they were.
+    - `prior_sigmas`: the largest part of the correction, in standard deviations of its prior.
+    - `path_change`: RMS distance by which keyframes would move with the correction, over the length of their path. Zero
+      where the correction may be chance.
     """
 
     correction: LensCorrection
@@ -114,19 +97,12 @@ class CalibrationEstimate:
 class PreferredCamera:
     """The camera that keyframes of a submap would rather have than the one that rectified their features.
 
-    Attributes
-    ----------
-    log_focal : float
-        The logarithm of both focal lengths that their pixels ask for, less that of the camera's.
-    log_focal_sigma : float
-    distance2 : float
-        Squared Mahalanobis distance of the whole correction from the camera's.
-    beyond_chance : bool
-        Whether the pixels contradict the camera.
-    keyframe_ids : (K,) int64
-    T_now, T_preferred : (K, 4, 4)
-        Their poses by the same pixels alone, under the current camera and the preferred one; each in a frame and unit
-        of its own.
+    - `log_focal`: the logarithm of both focal lengths that their pixels ask for, less that of the camera's.
+    - `distance2`: squared Mahalanobis distance of the whole correction from the camera's.
+    - `beyond_chance`: whether the pixels contradict the camera.
+    - `keyframe_ids` (K,) int64.
+    - `T_now`, `T_preferred` (K, 4, 4): their poses by the same pixels alone, under the current camera and the preferred
+      one; each in a frame and unit of its own.
     """
 
     log_focal: float
@@ -142,14 +118,9 @@ class PreferredCamera:
 class KeyframeReport:
     """Effect of a keyframe on the map and its graph.
 
-    Attributes
-    ----------
-    posed : GraphEstimate
-        With the keyframe's matches alone, before anything was placed from its pose.
-    grown : GraphEstimate, optional
-        With what was then added; None where the graph takes it in later.
-    solver_failed : bool
-        It threw and had to be made anew.
+    - `posed`: with the keyframe's matches alone, before anything was placed from its pose.
+    - `grown`: with what was then added; None where the graph takes it in later.
+    - `solver_failed`: it threw and had to be made anew.
     """
 
     posed: GraphEstimate
@@ -171,14 +142,9 @@ class KeyframeReport:
 class ReadoutEstimate:
     """By how much longer images are read, from the first row to the last, than their features were corrected for.
 
-    Attributes
-    ----------
-    more_s : float
-        Negative: they are read for less long.
-    sigma_s : float
-        Its standard deviation, by the residuals' own noise.
-    n_keyframes, n_observations : int
-        That gave it.
+    - `more_s`: negative: they are read for less long.
+    - `sigma_s`: its standard deviation, by the residuals' own noise.
+    - `n_keyframes`, `n_observations`: that gave it.
     """
 
     more_s: float

@@ -89,10 +89,7 @@ _DECIDED = {
 class EventLog:
     """Append-only list of events.
 
-    Attributes
-    ----------
-    decisions : DecisionSink
-        Receives the decisions of a run, those that events tell of included.
+    - `decisions`: receives the decisions of a run, those that events tell of included.
     """
 
     def __init__(self) -> None:

@@ -247,10 +247,7 @@ class Matches:
 class Keyframe:
     """A frame that the map keeps. Its pose and its landmarks belong to the submap, not to it.
 
-    Attributes
-    ----------
-    id : int
-        The index of its source frame: the same frame has the same keyframe id in every submap.
+    - `id`: the index of its source frame: the same frame has the same keyframe id in every submap.
     """
 
     id: int
@@ -262,26 +259,15 @@ class Keyframe:
 class Track:
     """A posed frame.
 
-    Attributes
-    ----------
-    view : View
-    T_cam_submap : (4, 4) float64
-    T_predicted : (4, 4) float64
-        What the motion model said.
-    landmark_ids : (N,) int64
-        For each feature of the view the landmark it agrees with, or `NO_LANDMARK`.
-    visible_ids : (V,) int64
-        Landmarks that the search expected to see; none where the pose came from elsewhere.
-    n_matches, n_inliers : int
-        Landmarks that were matched, and that agree with the pose.
-    chi2 : float
-        Mean squared whitened residual per degree of freedom of the inliers.
-    wide : bool
-        Whether guided matching failed and the pose came from wide matching.
-    covariance : (6, 6) float64
-        Of `T_cam_submap`, for a left perturbation (rotation, translation).
-    n_by_pixels : int
-        Inliers that a pixel matcher found; the others are features that were matched.
+    - `T_cam_submap` (4, 4) float64.
+    - `T_predicted` (4, 4) float64: what the motion model said.
+    - `landmark_ids` (N,) int64: for each feature of the view the landmark it agrees with, or `NO_LANDMARK`.
+    - `visible_ids` (V,) int64: landmarks that the search expected to see; none where the pose came from elsewhere.
+    - `n_matches`, `n_inliers`: landmarks that were matched, and that agree with the pose.
+    - `chi2`: mean squared whitened residual per degree of freedom of the inliers.
+    - `wide`: whether guided matching failed and the pose came from wide matching.
+    - `covariance` (6, 6) float64: of `T_cam_submap`, for a left perturbation (rotation, translation).
+    - `n_by_pixels`: inliers that a pixel matcher found; the others are features that were matched.
     """
 
     view: View
@@ -313,12 +299,9 @@ class Track:
 class Rival:
     """Another answer to where a frame beyond a gap is, where what is seen there repeats itself.
 
-    Attributes
-    ----------
-    index : int
-        Of the frame.
-    T_cam_rival, T_cam_walked : (4, 4) float64
-        ``T_cam_submap`` by the other answer, and by the one that was gone by.
+    - `index`: of the frame.
+    - `T_cam_rival`, `T_cam_walked` (4, 4) float64: ``T_cam_submap`` by the other answer, and by the one that was gone
+      by.
     """
 
     index: int
@@ -335,17 +318,11 @@ class Rival:
 class Start:
     """A verified start of a submap.
 
-    Attributes
-    ----------
-    views : list of View
-        First view, witnesses, last view, in the order in which they were given.
-    T_first_cam : (V, 4, 4) float64
-    xyz : (N, 3) float64
-        In the first camera's frame; the median depth is 1.
-    feature : (V, N) int64
-        Feature of each point in each view, or -1.
-    numbers : dict
-        The measures that the checks looked at.
+    - `views`: first view, witnesses, last view, in the order in which they were given.
+    - `T_first_cam` (V, 4, 4) float64.
+    - `xyz` (N, 3) float64: in the first camera's frame; the median depth is 1.
+    - `feature` (V, N) int64: feature of each point in each view, or -1.
+    - `numbers`: the measures that the checks looked at.
     """
 
     views: list[View]

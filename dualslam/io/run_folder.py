@@ -85,16 +85,9 @@ class RunFolder:
     - `path`: made if it is not there.
     - `overwrite`: remove the files of an earlier run. Files that no run writes stay in any case.
 
-    Attributes
-    ----------
-    path : Path
-    n_events : int
-        How many events have been taken.
+    - `n_events`: how many events have been taken.
 
-    Raises
-    ------
-    OutputError
-        As `check_vacant` says, or if another run is writing there, or the folder cannot be made.
+    Raises `OutputError` as `check_vacant` does, or if another run is writing there, or the folder cannot be made.
     """
 
     def __init__(self, path: str | Path, *, overwrite: bool = False) -> None:

@@ -88,27 +88,14 @@ class RecordedSequence:
     ``image=None`` and an `error`. Reading goes on. The log has the first of these frames, and their number where the
     reading ends.
 
-    Attributes
-    ----------
-    name : str
-    camera : Camera
-    rate_hz : float
-        Frames a second as they are read, so the stride counts.
-    ground_truth : Trajectory or None
-        All that the source has, whatever the selection.
-    selection : Selection
-    source_indices : (M,) int64
-        Index in the source of each frame that is read, in reading order.
-    frame_timestamps : (M,) float64
-        The same frames' times, descending where `reverse`.
-    source_timestamps : (N,) float64
-        Times of all frames of the source.
-    exposure_s : (M,) float64 or None
-        Exposure times, where the source has them.
-    source : str
-        What it was opened from, by which it can be opened again; empty if that is not known.
-    calibration : str
-        Where the camera is from, for a person.
+    - `rate_hz`: frames a second as they are read, so the stride counts.
+    - `ground_truth`: all that the source has, whatever the selection.
+    - `source_indices` (M,) int64: index in the source of each frame that is read, in reading order.
+    - `frame_timestamps` (M,) float64: the same frames' times, descending where `reverse`.
+    - `source_timestamps` (N,) float64: times of all frames of the source.
+    - `exposure_s` (M,) float64 or None: exposure times, where the source has them.
+    - `source`: what it was opened from, by which it can be opened again; empty if that is not known.
+    - `calibration`: where the camera is from, for a person.
     """
 
     def __init__(

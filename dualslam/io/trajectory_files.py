@@ -97,12 +97,7 @@ def nearest_in_time(times_s: FloatArray, query_s: FloatArray) -> IntArray:
 def associate(reference_s: FloatArray, query_s: FloatArray, max_dt_s: float) -> tuple[IntArray, BoolArray]:
     """Find for each query time the nearest reference time.
 
-    Returns
-    -------
-    index : (Q,) int64
-        Row of `reference_s`, meaningful where `close`.
-    close : (Q,) bool
-        Whether the two are at most `max_dt_s` apart.
+    Returns rows of `reference_s` (Q,), and which of them are at most `max_dt_s` apart from the query (Q,).
     """
     if len(reference_s) == 0:
         return np.zeros(len(query_s), np.int64), np.zeros(len(query_s), bool)

@@ -52,10 +52,7 @@ def open_recording(path: Path) -> Recording:
 class VideoFile:
     """The frames of a video file.
 
-    Attributes
-    ----------
-    timestamps_s : (N,) float64
-        Presentation time of each frame in the file.
+    - `timestamps_s` (N,) float64: presentation time of each frame in the file.
     """
 
     def __init__(self, path: Path) -> None:

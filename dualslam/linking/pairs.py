@@ -13,10 +13,7 @@ from dualslam.map.submap import Submap
 class PairModel:
     """Pairs with their noise: the pixels' noise, and a relative deformation of the maps that grows from the centre.
 
-    Attributes
-    ----------
-    centre_new, centre_old : (3,)
-        Medians of the points.
+    - `centre_new`, `centre_old` (3,): medians of the points.
     """
 
     def __init__(self, pairs: Correspondences, old: Submap, new: Submap, deformation_sigma: float) -> None:

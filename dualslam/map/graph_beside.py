@@ -210,10 +210,7 @@ class BesideGraphs:
 
     `open_graph`: makes a graph of a submap in this process, solved.
 
-    Attributes
-    ----------
-    in_real_time : bool
-        Whether frames come by a clock.
+    - `in_real_time`: whether frames come by a clock.
     """
 
     def __init__(self, desk: Desk, window: WindowSolver, open_graph: Callable[[Submap], SubmapGraph]) -> None:

@@ -33,16 +33,10 @@ class SetJoin:
 class _Shared:
     """A place that two sets share, in their worlds.
 
-    Attributes
-    ----------
-    keyframes : (int, int)
-        One in either set.
-    S_a_b : (4, 4)
-        Between the two worlds.
-    T_b_cam : (4, 4)
-        Pose of the second keyframe.
-    within : float
-        Distance in the first world up to which another place says the same.
+    - `keyframes` (int, int): one in either set.
+    - `S_a_b` (4, 4): between the two worlds.
+    - `T_b_cam` (4, 4): pose of the second keyframe.
+    - `within`: distance in the first world up to which another place says the same.
     """
 
     match: PlaceMatch

@@ -37,10 +37,7 @@ class FrameBuffer:
     - `duration_s`: video time that is kept (the paper's k frames); at least as many frames as `SLOW_HZ` gives in it.
     - `max_mb`: hard bound on the memory of features and images, mebibytes, also while frozen.
 
-    Attributes
-    ----------
-    nbytes, peak_bytes : int
-        Memory of features and images, now and at most so far.
+    - `nbytes`, `peak_bytes`: memory of features and images, now and at most so far.
     """
 
     def __init__(self, duration_s: float, max_mb: float) -> None:

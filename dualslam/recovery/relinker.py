@@ -46,11 +46,8 @@ class Relinker:
     - `submap`: the growing one.
     - `onsets`: for each lost submap the frame from which on it is suspected to be corrupted.
 
-    Attributes
-    ----------
-    has_seen_enough : bool
-        Whether the next keyframes change nothing: the walk has met enough of a lost submap's healthy part. Or it has
-        met enough keyframes beyond a tear of its own map to test everything that could hold it together.
+    - `has_seen_enough`: whether the next keyframes change nothing: the walk has met enough of a lost submap's healthy
+      part. Or it has met enough keyframes beyond a tear of its own map to test everything that could hold it together.
     """
 
     def __init__(

@@ -25,10 +25,7 @@ def tightened(max_sigma: float, n_tries: int) -> float:
 class LinkTries:
     """Results of earlier tries at linking each lost map, over all walks and attempts.
 
-    Attributes
-    ----------
-    refused : Counter of int
-        By lost map, the tries that were refused for the scale.
+    - `refused`: by lost map, the tries that were refused for the scale.
     """
 
     def __init__(self, refused: Mapping[int, int] | None = None) -> None:

@@ -21,12 +21,9 @@ class Markup(str):
 def tag(name: str, /, *children: object, **attributes: object) -> Markup:
     """Return one element.
 
-    Parameters
-    ----------
-    *children : Markup, str, number, None or iterable of these
-        Text is escaped, None is left out.
-    **attributes
-        ``cls`` is class, a trailing underscore is dropped, other underscores become hyphens; None is left out.
+    - `*children`: text is escaped, None is left out.
+    - `**attributes`: ``cls`` is class, a trailing underscore is dropped, other underscores become hyphens; None is left
+      out.
     """
     text = "".join(
         f' {_attribute_name(key)}="{html.escape(_plain(value))}"'

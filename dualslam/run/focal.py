@@ -23,17 +23,10 @@ SEARCHED_FRAMES = 200
 def open_without_calibration(source: str, **selection: Any) -> RecordedSequence:
     """Open a source that has no calibration, by a camera that only has the size of its images.
 
-    Parameters
-    ----------
-    source : str
-        Not a webcam: what it shows is gone once it has been looked at.
-    **selection
-        Which frames, as in `open_source`.
+    - `source`: not a webcam: what it shows is gone once it has been looked at.
+    - `**selection`: which frames, as in `open_source`.
 
-    Raises
-    ------
-    InputError
-        If the source cannot be read.
+    Raises `InputError` if the source cannot be read.
     """
     sequence = open_source(source, fov_degrees=ANY_FOV_DEG, **selection)
     assert isinstance(sequence, RecordedSequence)  # a world has a camera of its own

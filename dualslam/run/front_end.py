@@ -25,13 +25,8 @@ def with_frontend_chosen(
     A saved map is continued by the front end that made it. ORB it is where frames cannot be looked at beforehand, and
     where the config has settings that are ORB's.
 
-    Parameters
-    ----------
-    config : Config
-    frames : Sequence or None
-        None where frames come only once, or must keep to a clock.
-    saved_map : path, optional
-        The run folder that is continued.
+    - `frames`: none where frames come only once, or must keep to a clock.
+    - `saved_map`: the run folder that is continued.
     """
     if config.frontend.name != AUTO:
         return config, None

@@ -43,10 +43,7 @@ class Interrupts:
     third one acts as it would without us. Signals that a parent process has set to be ignored stay ignored (nohup).
     Outside the main thread, where no signal comes, nothing is done.
 
-    Attributes
-    ----------
-    left : bool
-        Whether the second one has left something.
+    - `left`: whether the second one has left something.
     """
 
     def __init__(self) -> None:

@@ -130,19 +130,11 @@ def _refuse_others(opened: RecordedSequence | WorldSequence, source: str | Path,
 class WorldSequence:
     """Frames of a synthetic world, rendered ahead on a thread, with what a recording offers.
 
-    Attributes
-    ----------
-    name : str
-    camera : Camera
-    rate_hz : float
-        Of the frames that are read, so the stride counts.
-    ground_truth : Trajectory
-        Of the whole world, metres.
-    selection : Selection
-    source_indices : (N,) int64
-    frame_timestamps : (N,) float64
-    source : str
-        By which it can be made again; empty if that is not known.
+    - `rate_hz`: of the frames that are read, so the stride counts.
+    - `ground_truth`: of the whole world, metres.
+    - `source_indices` (N,) int64.
+    - `frame_timestamps` (N,) float64.
+    - `source`: by which it can be made again; empty if that is not known.
     """
 
     def __init__(self, world: SyntheticSequence, selection: Selection | None = None, source: str = "") -> None:

@@ -40,13 +40,8 @@ class PaceStatistics:
 class Pace:
     """Knows how late the frames are, and how many keyframes the graph beside does not know yet.
 
-    Attributes
-    ----------
-    in_real_time : bool
-        Whether frames come by a clock.
-    statistics : PaceStatistics
-    clock : callable
-        Seconds; measures by how much background results hold a frame up.
+    - `in_real_time`: whether frames come by a clock.
+    - `clock`: seconds; measures by how much background results hold a frame up.
     """
 
     def __init__(self) -> None:

@@ -23,12 +23,8 @@ from dualslam.system.state import State
 class Tracking:
     """Poses frames in a submap.
 
-    Attributes
-    ----------
-    on_pose : callable or None
-        Called with each frame's track as soon as it is posed.
-    posed_at : float or None
-        When the frame was posed, on the clock of `time.perf_counter`; None before that.
+    - `on_pose`: called with each frame's track as soon as it is posed.
+    - `posed_at`: when the frame was posed, on the clock of `time.perf_counter`; None before that.
     """
 
     def __init__(self, state: State, places: PlaceKeeping) -> None:

@@ -42,18 +42,10 @@ class LiveView:
 
     `port`: of 127.0.0.1; 0 takes a free one.
 
-    Attributes
-    ----------
-    url : str
-    on_save : callable or None
-        Called between two frames with a page of the map as it stands (HTML), where a person asks for it.
+    - `on_save`: called between two frames with a page of the map as it stands (HTML), where a person asks for it.
 
-    Raises
-    ------
-    InputError
-        If the viewer is not installed.
-    OutputError
-        If it cannot start, or the port is taken.
+    Raises `InputError` if the viewer is not installed.
+    Raises `OutputError` if it cannot start, or the port is taken.
     """
 
     def __init__(self, port: int = 0) -> None:

@@ -66,17 +66,9 @@ class DrawnWalk:
 class LiveScene:
     """A run as its messages tell it.
 
-    Attributes
-    ----------
-    drawn : dict of int to Drawn
-    stale : set of int
-        Submaps that were drawn anew since this was last emptied.
-    S_world : dict of int to (4, 4)
-    T_world_cam : (4, 4) or None
-        The newest camera that has a pose.
-    links : tuple of LinkLine
-    walks : tuple of DrawnWalk
-    statuses : list of str
+    - `stale`: submaps that were drawn anew since this was last emptied.
+    - `S_world` dict of int to (4, 4).
+    - `T_world_cam` (4, 4) or None: the newest camera that has a pose.
     """
 
     def __init__(self) -> None:

@@ -23,10 +23,6 @@ class RunState:
     """Current activity of a run, for a viewer.
 
     `n_frames`: how many frames there are, if that is known.
-
-    Attributes
-    ----------
-    n_done : int
     """
 
     def __init__(self, n_frames: int | None) -> None:

@@ -39,11 +39,7 @@ class ScheduledDesk:
     - `finish_wait_s`: how long the end of a run that was interrupted waits for what is under way.
     - `budget_s`: time after which a job that can stop early must, in real time.
 
-    Attributes
-    ----------
-    executor : Executor
-    on_record : callable or None
-        Called with each line of the schedule as soon as it is known.
+    - `on_record`: called with each line of the schedule as soon as it is known.
     """
 
     def __init__(

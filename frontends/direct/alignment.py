@@ -109,12 +109,8 @@ def shift(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Follow each patch from where the pose puts it.
 
-    Returns
-    -------
-    uv_px : (M, 2)
-    sigma_px : (M,)
-        Of the worse known direction, with a prior of `prior_px` about the pose's place.
-    correlation : (M,)
+    Returns pixels (M, 2); their sigmas (M,) in the direction that is known worse, with a prior of `prior_px` about the
+    pose's place; and correlations (M,).
     """
     templates = patches.templates(level, smear)
     greys, gradient = templates.greys[placed.row], templates.gradient[placed.row]

@@ -42,12 +42,7 @@ def detect_corners(
     - `margin_px`: width of the rim without corners, >= 3.
     - `cell_px`: side of the square cells in which emptiness is judged.
 
-    Returns
-    -------
-    xy : (N, 2) int64
-        Pixel (column, row).
-    response : (N,) float64
-        FAST score: the largest threshold at which the corner would still be one.
+    Returns pixels (N, 2) as (column, row), and FAST scores (N,): the largest threshold at which each is a corner.
     """
     height, width = image.shape
     if min(height, width) <= 2 * margin_px:
@@ -139,11 +134,7 @@ def refine_corners(peaks: Peaks) -> tuple[FloatArray, BoolArray]:
     of the image. On KITTI and 7-Scenes pairs it brings the median epipolar residual from 0.31 to 0.13 pixels of the
     level (Harris, minimal eigenvalue and Foerstner gain almost nothing: they peak somewhere else).
 
-    Returns
-    -------
-    offset : (N, 2) float64
-        (du, dv) in pixels of the level, at most 1.75; zero where there is no extremum.
-    found : (N,) bool
+    Returns (du, dv) in pixels of the level (N, 2), at most 1.75 and zero where there is no extremum; and where one is.
     """
     offset, found = quadratic_peak(peaks.response, MIN_CURVATURE)
     offset += peaks.middle
@@ -192,11 +183,7 @@ def quadratic_peak(response: NDArray[np.floating], min_curvature: float = 0.0) -
     - `response` (N, 3, 3): the middle is the highest, or nearly.
     - `min_curvature`: by so much a peak curves downwards at least, in both directions together.
 
-    Returns
-    -------
-    offset : (N, 2) float64
-        (du, dv) from the middle; anything where there is no such maximum.
-    found : (N,) bool
+    Returns (du, dv) from the middle (N, 2), anything where there is no such maximum; and where one is.
     """
     r = response.astype(np.float64)
     gradient_u, gradient_v = (r[:, 1, 2] - r[:, 1, 0]) / 2, (r[:, 2, 1] - r[:, 0, 1]) / 2

@@ -84,20 +84,9 @@ class _Found:
 class Refinder:
     """Knows the images of a front end's latest keyframes, and whether a gap lies behind it.
 
-    Attributes
-    ----------
-    images : KeyframeImages
-    camera : callable
-        The camera that rectifies the features now.
-
-    Parameters
-    ----------
-    frontend : Frontend
-        The live one.
-    camera : callable
-        See above.
-    model_sigma_px : float
-        Error of its model, see `CameraConfig.model_sigma_px`.
+    - `frontend`: the live one.
+    - `camera`: the camera that rectifies the features now.
+    - `model_sigma_px`: error of its model, see `CameraConfig.model_sigma_px`.
     """
 
     def __init__(self, submap: Submap, frontend: Frontend, camera: Callable[[], Camera], model_sigma_px: float) -> None:

@@ -46,12 +46,8 @@ class ReadoutEstimator:
 
     `min_evidence`: see `READOUT_EVIDENCE`.
 
-    Attributes
-    ----------
-    suspects : bool
-        Whether a rolling shutter is likely, though its time is not known yet.
-    is_done : bool
-        Whether more frames would hardly change the time.
+    - `suspects`: whether a rolling shutter is likely, though its time is not known yet.
+    - `is_done`: whether more frames would hardly change the time.
     """
 
     def __init__(self, frontend: Frontend, seed: int, min_evidence: float) -> None:

@@ -40,10 +40,7 @@ def _largest(features: Features) -> Features:
 class TurnMeter:
     """How the camera turns from frame to frame, by matches.
 
-    Attributes
-    ----------
-    between_rad_s : (3,) float64 or None
-        Between the two last views; None if unknown.
+    - `between_rad_s` (3,) float64 or None: between the two last views; None if unknown.
     """
 
     def __init__(self, frontend: Frontend) -> None:

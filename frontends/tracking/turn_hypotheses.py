@@ -30,10 +30,7 @@ class TurnHypotheses:
     - `uv_a_px`, `uv_b_px` (N, 2): matched pixels of two views, undistorted; N > 0.
     - `sigma_px` (N,): of a pixel's coordinate.
 
-    Attributes
-    ----------
-    n_moved : int
-        Matches that the turn of most does not explain: they alone tell of a translation.
+    - `n_moved`: matches that the turn of most does not explain: they alone tell of a translation.
     """
 
     def __init__(

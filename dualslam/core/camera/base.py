@@ -105,12 +105,9 @@ class Camera(ABC):
 
         `uv` (N, 2).
 
-        Returns
-        -------
-        uv_rect : (N, 2)
-            Pixels of the pinhole camera `K`; NaN for rays beyond `MAX_RECTIFIED_ANGLE_RAD` or outside the model.
-        magnification : (N,)
-            Root of the determinant of d(uv_rect)/d(uv): a raw sigma times this is the sigma of the rectified pixel.
+        Returns pixels (N, 2) of the pinhole camera `K`, NaN for rays beyond `MAX_RECTIFIED_ANGLE_RAD` or outside the
+        model; and the zoom (N,): the root of the determinant of d(uv_rect)/d(uv). A raw sigma times this is the
+        rectified pixel's.
         """
         rays = self.unproject(uv)
         z = np.where(rays[:, 2] > math.cos(MAX_RECTIFIED_ANGLE_RAD), rays[:, 2], np.nan)

@@ -76,10 +76,7 @@ class LayeredCamera(Camera):
 class CorrectedCamera(LayeredCamera):
     """A camera whose rectified pixels are those of another, corrected. Made by `correct`.
 
-    Attributes
-    ----------
-    base : Camera
-        As it was given; `width` to `cy` are its own.
+    - `base`: as it was given; `width` to `cy` are its own.
     """
 
     model: ClassVar[str] = "corrected"

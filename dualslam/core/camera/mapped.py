@@ -22,10 +22,7 @@ SAME_PX = 1.0
 class MappedCamera(LayeredCamera):
     """A camera whose rays are its own, and whose rectified pixels are those of a map. Made by `camera_for_map`.
 
-    Attributes
-    ----------
-    base : Camera
-        `width` to `cy` are its own.
+    - `base`: `width` to `cy` are its own.
     """
 
     model: ClassVar[str] = "mapped"

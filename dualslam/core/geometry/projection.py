@@ -41,12 +41,7 @@ def project_points(K: FloatArray, T_cam_w: FloatArray, xyz: ArrayLike) -> tuple[
     - `K` (3, 3): intrinsics, pixels; zero skew.
     - `xyz` (N, 3): points in w.
 
-    Returns
-    -------
-    uv : (N, 2)
-        Pixels; NaN where the point is not in front of the camera.
-    depth : (N,)
-        z in the camera frame.
+    Returns pixels (N, 2), NaN where the point is not in front of the camera; and z in the camera frame (N,).
     """
     p = np.asarray(xyz, np.float64) @ T_cam_w[:3, :3].T + T_cam_w[:3, 3]
     depth = p[:, 2]
@@ -60,12 +55,7 @@ def project_points(K: FloatArray, T_cam_w: FloatArray, xyz: ArrayLike) -> tuple[
 def projection_jacobians(K: FloatArray, T_cam_w: FloatArray, xyz: ArrayLike) -> tuple[FloatArray, FloatArray]:
     """Return derivatives of the pixels of `project_points`.
 
-    Returns
-    -------
-    J_pose : (N, 2, 6)
-        With respect to xi of ``exp(xi) @ T_cam_w``, rotation first.
-    J_point : (N, 2, 3)
-        With respect to the point in w.
+    Returns those by xi of ``exp(xi) @ T_cam_w``, rotation first (N, 2, 6), and those by the point in w (N, 2, 3).
     """
     p = np.asarray(xyz, np.float64) @ T_cam_w[:3, :3].T + T_cam_w[:3, 3]
     iz = 1.0 / p[:, 2]

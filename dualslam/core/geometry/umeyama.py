@@ -80,11 +80,8 @@ def umeyama_batch(src: FloatArray, dst: FloatArray) -> tuple[FloatArray, BoolArr
 
     `src`, `dst` (B, 3, 3): B sets of three corresponding points, one point a row. (Any number of points a set works.)
 
-    Returns
-    -------
-    S_dst_src : (B, 4, 4)
-    valid : (B,) bool
-        False where a triplet is coincident or collinear on either side; its similarity then means nothing.
+    Returns ``S_dst_src`` (B, 4, 4), and which of them are valid (B,): none of a triplet that is coincident or collinear
+    on either side.
     """
     mean_src, mean_dst = src.mean(1), dst.mean(1)
     a, b = src - mean_src[:, None], dst - mean_dst[:, None]

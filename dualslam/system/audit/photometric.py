@@ -44,11 +44,8 @@ class Stretch:
 class PhotometricAudit:
     """Compares tracked frames with the patches of older keyframes, a few times a second.
 
-    Attributes
-    ----------
-    samples : list of Sample
-    repeated : set of int
-        Frames whose image is that of the frame before: the camera hung, or the video was made from fewer frames.
+    - `repeated`: frames whose image is that of the frame before: the camera hung, or the video was made from fewer
+      frames.
     """
 
     def __init__(self, patches: PatchCheck) -> None:
