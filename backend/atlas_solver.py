@@ -46,7 +46,7 @@ class GtsamAtlasSolver:
     """The `dualslam.core.atlas_problem.AtlasSolver` made with GTSAM.
 
     - `robust`: let graduated non-convexity choose among doubtful connections; else all are obeyed.
-    - `robust_k`: huber threshold of the submaps' projections, in sigmas.
+    - `robust_k`: Huber threshold of the submaps' projections, in sigmas.
     """
 
     def __init__(self, robust: bool, robust_k: float) -> None:

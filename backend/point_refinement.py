@@ -1,11 +1,10 @@
-"""Points that are no variables of the graph: refined by their views with the poses held, and how sure they are then."""
+"""Points that are no variables of the graph: refined by their views with the poses held."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from dualslam.backend.observability import projection_jacobian, reproject, sum_products
-from dualslam.core.noise_model import MIN_DEPTH_MU
 from dualslam.core.types import FloatArray, IntArray
 from dualslam.map.submap import Submap
 
@@ -94,22 +93,3 @@ def refit_points(submap: Submap, robust_k: float, landmark_ids: IntArray) -> Flo
     xyz = submap.landmarks["xyz_mu"][landmark_ids]
     T, point, pixels = submap.keyframe_poses(ids), place[obs["landmark"][rows]], submap.observed_pixels(rows)
     return refine_points(submap.K, T, pose, xyz, point, *pixels, robust_k, REFIT_STEPS)
-
-
-def triangulation_covariances(
-    K: FloatArray, T_submap_kf: FloatArray, pose: IntArray, xyz_mu: FloatArray, point: IntArray, sigma_px: FloatArray
-) -> FloatArray:
-    """Return (P, 3, 3): the covariance of each point by its views alone, the poses taken as known; NaN without a depth.
-
-    `K`, `T_submap_kf`, `pose`, `xyz_mu`, `point`, `sigma_px`: as in `refine_points`.
-    """
-    R, t = T_submap_kf[pose, :3, :3], T_submap_kf[pose, :3, 3]
-    xyz_cam = np.einsum("rji,rj->ri", R, xyz_mu[point] - t)
-    front = xyz_cam[:, 2] > MIN_DEPTH_MU
-    J = projection_jacobian(K, R[front], xyz_cam[front], sigma_px[front])
-    information = sum_products(J, J, point[front], len(xyz_mu))
-    covariances = np.full((len(xyz_mu), 3, 3), np.nan)
-    values = np.linalg.eigvalsh(information)
-    known = values[:, 0] > 1e-9 * values[:, 2]
-    covariances[known] = np.linalg.inv(information[known])
-    return covariances

@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
 from dualslam.backend.factor_index import FactorIndex
 from dualslam.backend.observability import numbered, take_mask
-from dualslam.backend.point_refinement import triangulation_covariances
-from dualslam.core.geometry import so3
 from dualslam.core.types import BoolArray, FloatArray, IntArray
 from dualslam.map.submap import Submap
-from dualslam.map.tables import Table
 
 READ_WINDOW = 20
 """Keyframes (the last inserted ones, and their landmarks) whose estimate is read after each update."""
@@ -85,47 +82,3 @@ def views_of(submap: Submap, ids: IntArray, inside: IntArray, poses: Mapping[int
     keyframes, pose = numbered(obs["kf"][row])
     T = [poses[k] if k in poses else submap.T_submap_kf[k] for k in keyframes.tolist()]
     return Views(row, np.array(T).reshape(-1, 4, 4), pose, np.searchsorted(ids, obs["landmark"][row]))
-
-
-def triangulated_covariances(
-    submap: Submap, landmark_ids: IntArray, rows: Table, pose_covariance: Callable[[int], FloatArray]
-) -> FloatArray:
-    """Return (L, 3, 3) covariances of landmarks beside a graph, in the submap's frame; NaN for those that are not.
-
-    Of the views of a point, the poses held, and of the pose of the newest of them, with which the point moves.
-
-    - `landmark_ids` (L,).
-    - `rows`: `FactorIndex.rows`.
-    - `pose_covariance`: of a keyframe.
-    """
-    ids = np.asarray(landmark_ids, np.int64)
-    covariances = np.full((len(ids), 3, 3), np.nan)
-    inside, factors = np.flatnonzero(rows["admitted"]), np.flatnonzero(rows["factor"] >= 0)
-    in_graph = take_mask(submap.observations["landmark"][factors], len(submap.landmarks))
-    wanted = np.intersect1d(ids, landmarks_beside(submap, inside, in_graph, None))
-    if len(wanted) == 0:
-        return covariances
-    views, xyz = views_of(submap, wanted, inside, {}), submap.landmarks["xyz_mu"][wanted]
-    sigma = rows["sigma_px"][views.row]
-    found = triangulation_covariances(submap.K, views.T_submap_kf, views.pose, xyz, views.point, sigma)
-    found += _newest_pose_covariances(submap, views, xyz, pose_covariance)
-    place = np.searchsorted(wanted, ids).clip(max=len(wanted) - 1)
-    mine = wanted[place] == ids
-    covariances[mine] = found[place[mine]]
-    return covariances
-
-
-def _newest_pose_covariances(
-    submap: Submap, views: Views, xyz: FloatArray, pose_covariance: Callable[[int], FloatArray]
-) -> FloatArray:
-    """Return (N, 3, 3): what each point moves by with the pose of the newest keyframe that sees it."""
-    covariances = np.zeros((len(xyz), 3, 3))
-    newest = np.full(len(xyz), -1)
-    np.maximum.at(newest, views.point, submap.observations["kf"][views.row])
-    for k in np.unique(newest).tolist():
-        T, P, of = submap.T_submap_kf[k], pose_covariance(k), np.flatnonzero(newest == k)
-        arm = (xyz[of] - T[:3, 3]) @ T[:3, :3]
-        J = np.concatenate((-so3.hat(arm), np.broadcast_to(np.eye(3), (len(of), 3, 3))), axis=2)
-        J = T[:3, :3] @ J
-        covariances[of] = J @ P @ J.transpose(0, 2, 1)
-    return covariances

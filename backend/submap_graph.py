@@ -25,7 +25,6 @@ from dualslam.backend.reading import (
     READ_WINDOW,
     choose_part,
     landmarks_beside,
-    triangulated_covariances,
     views_of,
 )
 from dualslam.backend.solver import (
@@ -184,16 +183,6 @@ class ISam2SubmapGraph:
             except SolverFailure as failure:
                 raise SolverError(f"no covariance of landmark {j}: {failure}; rebuild the graph") from failure
         return covariances
-
-    def triangulated_covariances(self, submap: Submap, landmark_ids: IntArray) -> FloatArray:
-        """Return (L, 3, 3) covariances of points beside the graph, in the submap's frame; NaN for those that are not.
-
-        That of the views of a point, the poses held, and that of the pose of the newest of them, with which the point
-        moves. Points that are variables have theirs from `point_covariances`.
-
-        Raises `SolverError` if the solver cannot tell a pose's.
-        """
-        return triangulated_covariances(submap, landmark_ids, self._factor_index.rows, self.pose_covariance)
 
     def rows_out(self, submap: Submap) -> IntArray:
         """Return the rows of dead observations whose factors, if they were any, an update has removed."""

@@ -18,6 +18,7 @@ from dualslam.backend.noise import LEAST_NOISE, OUTLIER_CHI2, residual_variance
 from dualslam.backend.observability import projection_jacobian, reproject
 from dualslam.backend.point_refinement import huber, normal_equations
 from dualslam.backend.selection import spread_evenly
+from dualslam.core.bundle import BundleProblem
 from dualslam.core.estimates import GraphEstimate
 from dualslam.core.firsts import rank_in_runs
 from dualslam.core.geometry import se3, so3
@@ -35,21 +36,6 @@ CONVERGED = 1e-4
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Window:
-    """A window to be adjusted. Observations are sorted by point."""
-
-    K: FloatArray  # (3, 3)
-    T_submap_kf: FloatArray  # (F, 4, 4): the free ones first
-    n_free: int
-    xyz_mu: FloatArray  # (P, 3)
-    # Rows of `T_submap_kf` and `xyz_mu` of each observation.
-    pose: IntArray  # (R,)
-    point: IntArray  # (R,)
-    uv_px: FloatArray  # (R, 2)
-    sigma_px: FloatArray  # (R,)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class _State:
     T: FloatArray
     xyz: FloatArray
@@ -63,7 +49,7 @@ class _State:
 class NumpyWindowSolver:
     """The `dualslam.core.interfaces.WindowSolver` in numpy.
 
-    - `robust_k`: huber threshold in sigmas.
+    - `robust_k`: Huber threshold in sigmas.
     """
 
     def __init__(self, robust_k: float) -> None:
@@ -88,14 +74,14 @@ class NumpyWindowSolver:
             return Failure(FailureReason.SOLVER, "the window has no optimum")
         n_views = np.bincount(window.point, minlength=len(ids))[window.point]
         noise2 = residual_variance(after.chi2, n_views, LEAST_NOISE**2)
-        mine = window.pose == 0
+        mine = window.kf == 0
         chi2 = np.minimum(after.chi2[mine], INSERT_SIGMAS**2)
         sound = np.isfinite(after.xyz).all(axis=1) & (
             sum_by(window.point, np.isinf(after.chi2)[:, None], len(ids))[:, 0] == 0
         )
         return GraphEstimate(
             keyframe_ids=np.array(free, np.int64),
-            T_submap_kf=after.T[: window.n_free],
+            T_submap_kf=after.T[: len(free)],
             landmark_ids=ids[sound],
             xyz_mu=after.xyz[sound],
             outlier_rows=np.sort(row[mine & (after.chi2 > OUTLIER_CHI2 * noise2)]),
@@ -106,8 +92,8 @@ class NumpyWindowSolver:
         )
 
 
-def _window(submap: Submap, free: list[int], landmark_ids: IntArray) -> tuple[IntArray, IntArray, Window]:
-    """Return the rows that count, their keyframes (the free ones first), and the window."""
+def _window(submap: Submap, free: list[int], landmark_ids: IntArray) -> tuple[IntArray, IntArray, BundleProblem]:
+    """Return the rows that count, their keyframes, and the window, whose free poses come first."""
     obs = submap.observations
     row = submap.rows_of_landmarks(landmark_ids)
     kf, point = obs["kf"][row], np.searchsorted(landmark_ids, obs["landmark"][row])
@@ -124,23 +110,26 @@ def _window(submap: Submap, free: list[int], landmark_ids: IntArray) -> tuple[In
     uv, sigma = submap.observed_pixels(row)
     pose = by_id[np.searchsorted(keyframes[by_id], kf)]
     T, xyz = submap.keyframe_poses(keyframes), submap.landmarks["xyz_mu"][landmark_ids]
-    return row, keyframes, Window(submap.K, T, len(free), xyz, pose, point, uv, sigma)
+    fixed = np.arange(len(keyframes)) >= len(free)
+    return row, keyframes, BundleProblem(submap.K, T, fixed, xyz, pose, point, uv, sigma)
 
 
-def adjust_window(window: Window, robust_k: float, iterations: int = ITERATIONS) -> _State:
+def adjust_window(window: BundleProblem, robust_k: float, iterations: int = ITERATIONS) -> _State:
     """Run Levenberg-Marquardt on the free poses and all points, the points eliminated first.
 
     Poses move by ``T exp(xi)``, xi = (rotation, translation).
+
+    `window`: the free poses come first; observations are sorted by point.
     """
-    n_free, n_points = window.n_free, len(window.xyz_mu)
-    mine = np.flatnonzero(window.pose < n_free)
-    pose, point = window.pose[mine], window.point[mine]
+    n_free, n_points = int(np.count_nonzero(~window.fixed)), len(window.xyz_mu)
+    mine = np.flatnonzero(window.kf < n_free)
+    pose, point = window.kf[mine], window.point[mine]
     views = [np.flatnonzero(pose == f) for f in range(n_free)]
     state = _evaluate(window, window.T_submap_kf, window.xyz_mu, robust_k)
     damping = FIRST_DAMPING
     for _ in range(iterations):
         safe = np.where(np.isfinite(state.chi2)[:, None], state.xyz_cam, [0.0, 0.0, 1.0])
-        R = state.T.take(window.pose, axis=0)[:, :3, :3]
+        R = state.T.take(window.kf, axis=0)[:, :3, :3]
         J = projection_jacobian(window.K, R, safe, window.sigma_px)
         V, g_point = normal_equations(J, state.weight, state.residuals, window.point, n_points)
         # By the pose: in the camera, a point moves by [p]x omega - v.
@@ -188,8 +177,8 @@ def _step(
     return T, state.xyz + dx
 
 
-def _evaluate(window: Window, T: FloatArray, xyz: FloatArray, robust_k: float) -> _State:
-    xyz_cam, front, uv_px = reproject(window.K, T, window.pose, xyz.take(window.point, axis=0))
+def _evaluate(window: BundleProblem, T: FloatArray, xyz: FloatArray, robust_k: float) -> _State:
+    xyz_cam, front, uv_px = reproject(window.K, T, window.kf, xyz.take(window.point, axis=0))
     residuals = uv_px - window.uv_px
     residuals /= window.sigma_px[:, None]
     chi2 = np.einsum("ri,ri->r", residuals, residuals)

@@ -152,11 +152,6 @@ class BesideGraph:
         graph: SubmapGraph = self.opened()
         return graph.point_covariances(landmark_ids)
 
-    def triangulated_covariances(self, submap: Submap, landmark_ids: IntArray) -> FloatArray:
-        """Return (L, 3, 3) of points that are no variables; see `opened`."""
-        covariances: FloatArray = self.opened().triangulated_covariances(submap, landmark_ids)
-        return covariances
-
     @property
     def factor_rows(self) -> IntArray:
         """Rows of the submap's observations that are factors; see `opened`."""

@@ -422,26 +422,6 @@ def test_the_choice_is_made_anew_where_a_map_is_past_its_first_keyframes():
     assert not any(x.rebuilt for x in grow(feeder, graph, rest[17:]))
 
 
-@pytest.mark.usefixtures("spare")
-def test_points_beside_the_graph_have_a_covariance_by_triangulation():
-    feeder, graph, rest = start(n=30, per_view=250, config=GraphConfig(factors_per_keyframe=40))
-    grow(feeder, graph, rest)
-    submap = feeder.submap
-    e = graph.full_estimate(submap)
-    apply(submap, e)
-    variables = np.unique(submap.observations["landmark"][graph.factor_rows])
-    beside = np.setdiff1d(e.landmark_ids, variables)
-    C = graph.triangulated_covariances(submap, np.concatenate([beside, variables[:5]]))
-    assert np.isnan(C[len(beside) :]).all()
-    assert np.isnan(graph.point_covariances(beside)).all()
-    C = C[: len(beside)]
-    assert np.isfinite(C).all()
-    truth = feeder.scene.xyz_true[feeder.point_of_landmark()[beside]]
-    off = submap.landmarks["xyz_mu"][beside] - truth
-    chi2 = np.einsum("pi,pij,pj->p", off, np.linalg.inv(C), off)
-    assert 0.5 < np.median(chi2) / 2.37 < 3.0  # 2.37: the median of chi-square with 3 degrees of freedom
-
-
 def test_keyframes_have_more_factors_where_few_see_the_same():
     """This corridor is a road: each stretch is seen from a handful of keyframes."""
     feeder, graph, rest = start(n=30, per_view=250, config=GraphConfig(factors_per_keyframe=40))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from dualslam.backend.submap_graph import ISam2SubmapGraph
-from dualslam.backend.window import NumpyWindowSolver, Window, _evaluate, _window, adjust_window
+from dualslam.backend.window import NumpyWindowSolver, _evaluate, _window, adjust_window
 from dualslam.core.config.settings import GraphConfig
 from dualslam.core.geometry import se3
 from dualslam.core.types import Failure
@@ -96,9 +96,8 @@ def test_points_and_poses_against_a_dense_least_squares_step() -> None:
     submap = feeder.submap
     free = newest(submap)
     _, _, window = _window(submap, free, submap.landmarks_of_keyframes(free[:1]))
-    assert isinstance(window, Window)
     best = adjust_window(window, 1.345, iterations=60)
-    for f in range(window.n_free):
+    for f in range(len(free)):
         for axis in range(6):
             costs = []
             for h in (1e-5, -1e-5):
