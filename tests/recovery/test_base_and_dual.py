@@ -9,8 +9,8 @@ from dualslam.core.config.files import config_from_dict
 from dualslam.core.events import EventKind
 from dualslam.lab.synthetic import make_sequence
 
-N = 50
-DARK = {"kind": "blackout", "start": 30, "length": 5}
+N = 36
+DARK = {"kind": "blackout", "start": 20, "length": 5}
 
 
 @pytest.mark.slow

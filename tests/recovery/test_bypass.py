@@ -17,7 +17,7 @@ POSITION_M, ROTATION_RAD = 0.08, 0.01
 
 
 def run(n_frames: int, **settings: object) -> tuple[System, PointWorld]:
-    world = PointWorld(cloud(), hand_held(n_frames), covered=COVERED)
+    world = PointWorld(cloud(500), hand_held(n_frames), covered=COVERED)
     values = {"recovery": {"attempts": ["live"], "retry_keyframes": [1000]}, "linking": NO_LINK} | settings
     system = system_in(world, **values)
     for frame in world.frames():

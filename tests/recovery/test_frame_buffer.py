@@ -195,7 +195,7 @@ class TestBound:
 
     @pytest.mark.slow
     def test_then_whole_frames_and_what_surrounds_the_stretch_stays(self) -> None:
-        n = 2000
+        n = 600
         buffer = overflown(n, 30, NOISE)
         kept = indices(buffer)
         assert kept[: len(self.before)] == self.before

@@ -361,7 +361,7 @@ class UnsteadyExecutor(LateExecutor):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", first_of([12, 15, 21, 22]))
+@pytest.mark.parametrize("seed", first_of([12, 15, 22]))
 def test_any_schedule_leaves_a_consistent_atlas(seed: int) -> None:
     rng = np.random.default_rng(seed)
     n, covered, at = 110, set(), 25

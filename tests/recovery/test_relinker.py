@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from types import SimpleNamespace
-from typing import Any, cast
+from typing import cast
 
 import numpy as np
+import pytest
 
 from dualslam.core.noise_model import GROUP
 from dualslam.core.types import Failure, FailureReason
@@ -20,7 +21,7 @@ def holding(submap_id: int, keyframes: range) -> Submap:
     return cast(Submap, SimpleNamespace(id=submap_id, keyframes=dict.fromkeys(keyframes)))
 
 
-def tries_of_a_walk(n: int, **settings: Any) -> tuple[list[int], int | None]:
+def tries_of_a_walk(n: int) -> tuple[list[int], int | None]:
     """Track back from keyframe 199 over n more; return the numbers shared at each try, and at which it was enough."""
     old, new = holding(0, range(200)), holding(1, range(200, 210))
     asked: list[int] = []
@@ -29,7 +30,7 @@ def tries_of_a_walk(n: int, **settings: Any) -> tuple[list[int], int | None]:
         asked.append(len(new.keyframes) - 10)
         return Failure(FailureReason.AGREEMENT, "no")
 
-    relinker = Relinker(new, {0: old}, {0: ONSET}, refuse, **settings)
+    relinker = Relinker(new, {0: old}, {0: ONSET}, refuse, 4)
     for shared in range(1, n + 1):
         k = 200 - shared
         new.keyframes[k] = None  # type: ignore[assignment]
@@ -44,19 +45,20 @@ def test_it_tries_at_each_of_the_first_shared_keyframes() -> None:
     assert asked == list(range(4, 13))
 
 
-def test_later_on_it_tries_at_each_tenth_part_more() -> None:
-    asked, _ = tries_of_a_walk(100, max_shared=200)
+def test_later_on_it_tries_at_each_tenth_part_more(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("dualslam.recovery.relinker.ENOUGH", 50)
+    asked, _ = tries_of_a_walk(100)
     late = [n for n in asked if n > 12]
     assert all(b >= 1.1 * a for a, b in zip([12, *late], late, strict=False))
     assert all(b <= 1.1 * a + 1 for a, b in zip([12, *late], late, strict=False))
 
 
 def test_it_has_seen_enough_once_it_has_tried_with_so_many_healthy_keyframes() -> None:
-    asked, ended = tries_of_a_walk(150, max_shared=30)
+    asked, ended = tries_of_a_walk(150)
     suspected = 200 - ONSET
     assert ended is not None
     assert ended == asked[-1]
-    assert 30 <= ended - suspected <= 1.1 * (30 + suspected) + 1 - suspected
+    assert 40 <= ended - suspected <= 1.1 * (40 + suspected) + 1 - suspected
 
 
 def test_a_keyframe_that_the_lost_map_does_not_hold_is_no_reason_to_try() -> None:
@@ -65,7 +67,7 @@ def test_a_keyframe_that_the_lost_map_does_not_hold_is_no_reason_to_try() -> Non
     def never(old: Submap, new: Submap, onset: int | None) -> Failure:
         raise AssertionError
 
-    assert not list(Relinker(new, {0: old}, {0: ONSET}, never).attempts(11))
+    assert not list(Relinker(new, {0: old}, {0: ONSET}, never, 4).attempts(11))
 
 
 def test_over_keyframes_that_an_earlier_walk_has_left_it_tries_once() -> None:
@@ -76,7 +78,7 @@ def test_over_keyframes_that_an_earlier_walk_has_left_it_tries_once() -> None:
         asked.append(len(old.keyframes.keys() & new.keyframes.keys()))
         return Failure(FailureReason.AGREEMENT, "no")
 
-    relinker = Relinker(new, {0: old}, {0: ONSET}, refuse)
+    relinker = Relinker(new, {0: old}, {0: ONSET}, refuse, 4)
     for k in range(99, 84, -1):
         new.keyframes[k] = None  # type: ignore[assignment]
         list(relinker.attempts(k))
@@ -89,7 +91,7 @@ def test_a_map_that_is_torn_stays_so_once_all_is_there_that_is_asked_about_the_p
     def refuse(old: Submap, new: Submap, onset: int | None) -> Failure:
         return LinkRefusal(FailureReason.DEFORMED, "torn", torn_at=198)
 
-    relinker = Relinker(new, {0: old}, {0: ONSET}, refuse)
+    relinker = Relinker(new, {0: old}, {0: ONSET}, refuse, 4)
     enough = []
     for k in range(199, 191, -1):
         new.keyframes[k] = None  # type: ignore[assignment]
@@ -105,7 +107,7 @@ def test_lost_maps_of_too_few_keyframes_are_hopeless_once_all_are_held() -> None
 
     for n in (3, 4):
         new = holding(1, range(n, 20))
-        relinker = Relinker(new, {0: holding(0, range(n))}, {0: ONSET}, never)
+        relinker = Relinker(new, {0: holding(0, range(n))}, {0: ONSET}, never, 4)
         assert not relinker.is_hopeless
         new.keyframes |= dict.fromkeys(range(n))  # type: ignore[arg-type]
         assert relinker.is_hopeless == (n < 4)
