@@ -16,12 +16,13 @@ import numpy as np
 import dualslam
 from dualslam.build import create_frontend
 from dualslam.core.config.settings import FrontendConfig
-from dualslam.places.faiss_index import CELLS, N_CELLS
+from dualslam.places.faiss_index import CELLS
 
 SOURCES = (
     *(f"synthetic:street,frames=240,seed={seed}" for seed in (90001, 90002)),
     *(f"synthetic:room,frames=160,seed={seed}" for seed in (90003, 90004)),
 )
+N_CELLS = 1024
 EVERY = 8  # frames between two that are learnt from
 
 

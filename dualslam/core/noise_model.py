@@ -43,6 +43,12 @@ COVISIBLE = 15
 """Landmarks in common from which two keyframes count as covisible."""
 ROBUST_N = 5
 """Numbers whose median survives two outliers."""
+GROWN = 1.5
+"""Times its keyframes, from which a map is worth a question again: a sigma is then a fifth smaller at best."""
+ROBUST_K = 0.8
+"""Huber threshold in sigmas: about twice what residuals are."""
+DAMPING = 1e-4
+"""Of normal equations, relative to the diagonal: keeps where it is what nothing fixes."""
 MAX_TRIES = 3
 """Times that what fails by chance is tried in vain before it counts as broken."""
 UNSURE_SCALE = 0.07

@@ -18,11 +18,10 @@ from dualslam.core.config.calibration_config import CalibrationConfig
 from dualslam.core.errors import InputError, SolverError
 from dualslam.core.estimates import CalibrationEstimate
 from dualslam.core.interfaces import SelfCalibrator, SubmapAdjuster, SubmapGraph
+from dualslam.core.noise_model import GROWN
 from dualslam.core.types import Failure, FailureReason, Features, FloatArray, Keyframe, View
 from dualslam.map.submap import Submap
 
-GROWTH = 1.5
-"""Each next time comes when it has so many times the keyframes."""
 UPDATE_SIGMA_RATIO = 0.7
 """A camera may have been changed by an answer less sure than `max_focal_sigma`. It is changed again, however little, if
 the new sigma of the focal length is below this share of that answer's: twice the information. One that was sure stays,
@@ -153,7 +152,7 @@ class Calibration:
         self._estimated.add(answer.submap.id)
 
     def _asked(self, submap_id: int, n: int) -> None:
-        self._due_at[submap_id], self._asked_with[submap_id] = int(np.ceil(GROWTH * n)), n
+        self._due_at[submap_id], self._asked_with[submap_id] = int(np.ceil(GROWN * n)), n
 
     def _said_nothing(self, submap_id: int, n: int) -> None:
         self._due_at[submap_id] = n + max(RETRY_KEYFRAMES, int(RETRY_SHARE * n))

@@ -15,12 +15,12 @@ import faiss
 import numpy as np
 from numpy.typing import NDArray
 
+from dualslam.core.noise_model import COVISIBLE
 from dualslam.core.types import Features, FloatArray, IntArray
 from dualslam.map.submap import Submap
 from dualslam.places.recogniser import PlaceCandidate
 
 CELLS = Path(__file__).with_name("cells.npy")
-N_CELLS = 1024
 
 
 @cache
@@ -35,9 +35,6 @@ N_PROBED = 8
 """Cells that are searched for a descriptor: between the 4 and 16 that were measured (recall 0.91 and 0.97)."""
 N_NEAREST = 3
 """Landmarks that one feature may vote for: a point is often in the map more than once (lost and found again)."""
-MIN_VOTES = 15
-"""Below it a keyframe is not worth the verification, which wants 20 landmarks on a pose: matching around the
-keyframe finds about as many again as vote for it."""
 SAME_PLACE = 0.3
 """Share of landmarks in common from which two keyframes show one place: the worse of them is no other candidate."""
 
@@ -126,10 +123,10 @@ class FaissRecogniser:
             if m not in submaps:
                 continue
             own = submap_of[row] == m
-            if np.count_nonzero(own) < MIN_VOTES:
+            if np.count_nonzero(own) < COVISIBLE:
                 continue
             keyframes, votes = _votes(submaps[m], feature[own], landmark_of[row[own]], len(features))
-            strong = votes >= MIN_VOTES
+            strong = votes >= COVISIBLE
             pairs = zip(keyframes[strong].tolist(), votes[strong].tolist(), strict=True)
             voted += [PlaceCandidate(m, k, n) for k, n in pairs]
         voted.sort(key=lambda c: (-c.n_votes, c.submap_id, c.keyframe_id))

@@ -18,6 +18,7 @@ from dualslam.core.config.settings import Config
 from dualslam.core.events import EventKind
 from dualslam.core.interfaces import Seeker, SubmapGraph, VisualOdometry
 from dualslam.core.jobs import Desk, Ended, JobKind
+from dualslam.core.noise_model import MAX_TRIES
 from dualslam.core.types import Failure, FailureReason, FloatArray
 from dualslam.map.submap import Submap
 from dualslam.places.plausibility import agree, contradict, plausible
@@ -28,8 +29,6 @@ from dualslam.places.verification import PlaceMatch
 
 ASK_EVERY = 2
 """Keyframes between two searches, where nothing is provisional: neighbours show the same."""
-MAX_MISSES = 3
-"""Keyframes that may fail to confirm before the provisional pair is dropped."""
 REST, MAX_REST = 10, 40
 """Keyframes after a loop before the map that it lies in is searched again. Each loop that finds no more drift than the
 map claims doubles them: beside one that was closed a moment ago it tells next to nothing, and costs more the larger the
@@ -235,7 +234,7 @@ class Revisits:
         if match is None:
             if waiting is not None:
                 waiting.misses += 1
-                if waiting.misses > MAX_MISSES:
+                if waiting.misses > MAX_TRIES:
                     detail = f"{waiting.confirmations} of {N_CONFIRMING} keyframes confirmed it"
                     why = Failure(FailureReason.UNCONFIRMED, detail)
                     record_refusal(self._record, now, submap.id, *waiting.match.place, why)

@@ -12,7 +12,7 @@ from dualslam.core.config.settings import Config
 from dualslam.core.events import EventKind
 from dualslam.core.geometry import se3, so3
 from dualslam.core.interfaces import Seeker, SubmapGraph
-from dualslam.core.noise_model import SAME_WITHIN
+from dualslam.core.noise_model import GROUP, SAME_WITHIN
 from dualslam.core.support import judge_track
 from dualslam.core.types import Failure, FailureReason, FloatArray, Track, View
 from dualslam.map.submap import Submap
@@ -22,8 +22,6 @@ from dualslam.places.verification import PlaceVerifier
 
 N_CONFIRMING = 2
 """Keyframes (or frames) that must say the same as the first: three with it, where evidence begins for a link too."""
-YOUNG = 5
-"""Newest keyframes of the live submap whose own landmarks are not remembered yet: half of them will be culled."""
 SAME_TURN_RAD = float(np.radians(6.0))
 """The same for its rotation: twice 3 degrees."""
 SILENT = (FailureReason.TOO_FEW_MATCHES, FailureReason.TOO_FEW_INLIERS)
@@ -98,8 +96,9 @@ class Sightings:
         """
         n = 0
         for submap in self._record.atlas.submaps.values():
+            # Half of the landmarks of the newest keyframes will be culled.
             left = None if at_most is None else at_most - n
-            n += self._recogniser.take_in(submap, YOUNG if submap is live else 0, left)
+            n += self._recogniser.take_in(submap, GROUP if submap is live else 0, left)
         return n
 
     def avoid(self, submap_id: int) -> None:

@@ -17,11 +17,9 @@ from dualslam.map.submap import Submap
 from dualslam.recovery.job import FoundLink, RecoveryParts
 from dualslam.recovery.walk import Walk
 
-MIN_SHARED_KEYFRAMES = 4
-"""Keyframes that both maps must hold before a link is tried."""
-MAX_SHARED_KEYFRAMES = 40
-"""Healthy keyframes of a lost map that a walk holds when its last try to link them is made: ten times what a link must
-stand on. A walk that fits none of so many is bent, and going on bends it further."""
+ENOUGH = 10
+"""Times the keyframes that a link needs, of a lost map's healthy ones that a walk holds when its last try to link them
+is made. A walk that fits none of so many is bent, and going on bends it further."""
 
 Linker = Callable[[Submap, Submap, int | None], LinkEstimate | Failure]
 
@@ -45,6 +43,7 @@ class Relinker:
 
     - `submap`: the growing one.
     - `onsets`: for each lost submap the frame from which on it is suspected to be corrupted.
+    - `min_shared`: keyframes that both maps must hold before a link is tried.
 
     - `has_seen_enough`: whether the next keyframes change nothing: the walk has met enough of a lost submap's healthy
       part. Or it has met enough keyframes beyond a tear of its own map to test everything that could hold it together.
@@ -56,11 +55,11 @@ class Relinker:
         lost: dict[int, Submap],
         onsets: dict[int, int],
         linker: Linker,
-        max_shared: int = MAX_SHARED_KEYFRAMES,
+        min_shared: int,
     ) -> None:
         self._submap = submap
         self._linker = linker
-        self._max_shared = max_shared
+        self._min_shared = min_shared
         self._onsets = onsets
         self._old = [lost[m] for m in sorted(lost)]
         self._tried_with: dict[int, int] = {}  # by old map: how many keyframes were shared at the last try
@@ -79,7 +78,7 @@ class Relinker:
     @property
     def is_hopeless(self) -> bool:
         """Whether the growing submap holds all keyframes of the lost submaps, and these are too few for any link."""
-        return self.holds_all and all(len(old.keyframes) < MIN_SHARED_KEYFRAMES for old in self._old)
+        return self.holds_all and all(len(old.keyframes) < self._min_shared for old in self._old)
 
     def attempts(self, keyframe_id: int) -> Iterator[LinkTry]:
         """Try each lost submap that holds the newest keyframe of the walk, the latest lost one first."""
@@ -88,7 +87,7 @@ class Relinker:
             if keyframe_id not in shared or not self._is_due(old.id, len(shared)):
                 continue
             n_healthy = sum(k < self._onsets[old.id] for k in shared)
-            self.has_seen_enough |= n_healthy >= self._max_shared
+            self.has_seen_enough |= n_healthy >= ENOUGH * self._min_shared
             result = self._linker(old, self._submap, self._onsets[old.id])
             self.has_seen_enough |= isinstance(result, LinkRefusal) and self._stays_torn(result)
             yield LinkTry(old.id, len(shared), result)
@@ -99,7 +98,7 @@ class Relinker:
         return torn_at is not None and sum(k < torn_at for k in self._submap.keyframes) >= GROUP
 
     def _is_due(self, old_id: int, n_shared: int) -> bool:
-        if n_shared < MIN_SHARED_KEYFRAMES:
+        if n_shared < self._min_shared:
             return False
         if n_shared == self._tried_with.get(old_id):  # over keyframes that an earlier walk has left
             return False

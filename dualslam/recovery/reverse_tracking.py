@@ -207,7 +207,7 @@ def _walk(job: RecoveryJob, parts: RecoveryParts, attempt: Attempt, tries: LinkT
     submap.apply_estimate(*estimate.values)
     reverse_tracker = attempt.new_odometry(job, submap, graph)
     reverse_tracker.start_at(job.newest_id)
-    relinker = Relinker(submap, job.lost, job.onsets, parts.link)
+    relinker = Relinker(submap, job.lost, job.onsets, parts.link, parts.config.linking.min_keyframes)
     reverse_tracker.keep(relinker.keyframe_ids)  # redundant or not: a link needs keyframes that both maps hold
     # Before a first map each frame is tried, however many show nothing: no link waits for the end of that walk.
     max_gap_frames = parts.config.recovery.max_gap_frames if job.lost else len(job.views)

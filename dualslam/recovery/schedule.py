@@ -9,6 +9,7 @@ from statistics import NormalDist
 
 from dualslam.atlas.trajectory import FramePose
 from dualslam.core.camera.base import Camera
+from dualslam.core.noise_model import GROWN
 from dualslam.core.types import Failure, FailureReason, View
 from dualslam.map.submap import Submap
 
@@ -67,11 +68,6 @@ class LinkTries:
         return Failure(FailureReason.UNCONFIRMED, detail, {"sigma_scale": sigma_scale, "tries": n_refused + 1.0})
 
 
-LAST_GROWTH = 1.5
-"""Times the live keyframes that the last walk knew, from which on one more at the end of the run is worth it: a sigma
-then is a fifth smaller at best. Of 18 such walks that were made after any growth none has come to a link."""
-
-
 class RetrySchedule:
     """Knows of each submap whose walk has left something to find when the next walk is due.
 
@@ -120,7 +116,7 @@ class RetrySchedule:
         n_live = self.n_live(submap, now)
         due = not needs_camera and any(tried_with < n <= n_live for n in self._keyframes)
         due |= camera != tried_camera
-        due |= last_chance and not is_stuck and bool(self._keyframes) and n_live >= LAST_GROWTH * tried_with
+        due |= last_chance and not is_stuck and bool(self._keyframes) and n_live >= GROWN * tried_with
         if due:
             del self._tried[submap.id]
         return due

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from dualslam.core.camera.base import Camera
 from dualslam.core.geometry import se3
+from dualslam.core.noise_model import DAMPING
 from dualslam.core.types import BoolArray, FloatArray, IntArray
 from dualslam.frontends.direct.patches import Patches, Smear
 from dualslam.frontends.direct.warp import HALF, Pyramid, correlate, inside, project_with_jacobians, sample
@@ -24,7 +25,6 @@ STUDENT = 5.0
 MIN_PATCHES = 20
 MAX_ZOOM = 2.0
 """Change of size that the patch's plane, taken parallel to its image, tolerates."""
-DAMPING = 1e-4
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -30,13 +30,11 @@ from dualslam.frontends.direct.search import HALF_PX, match_patches
 from dualslam.frontends.direct.warp import Pyramid, build_pyramid, warp_points
 from dualslam.frontends.features.found_features import features_found
 from dualslam.frontends.gap.uncertainty import track_uncertainty
-from dualslam.frontends.tracking.keyframe_images import KeyframeImages
+from dualslam.frontends.tracking.keyframe_images import RIM_KEYFRAMES, KeyframeImages
 from dualslam.frontends.tracking.row_shifts import find_as_read
 from dualslam.map.landmark_views import landmark_covariances
 from dualslam.map.submap import Submap
 
-RIM_KEYFRAMES = 6
-"""Keyframes before a gap whose landmarks are looked for beyond it."""
 FAR_KEYFRAMES = 8
 """Keyframes beyond a gap in which they are: the wider these stand, the better they know the landmarks' depths."""
 SEARCH_RAD = 0.022

@@ -8,7 +8,9 @@ from dataclasses import dataclass
 from dualslam.core.grey_image import GreyImage
 from dualslam.core.types import FloatArray, View
 
-KEPT_IMAGES = 12
+RIM_KEYFRAMES = 6
+"""Keyframes before a gap whose landmarks are looked for beyond it."""
+KEPT_IMAGES = 2 * RIM_KEYFRAMES
 """Those nearest in time to the latest keyframe: twice the rim, since not each keyframe is there to stay."""
 
 

@@ -20,7 +20,7 @@ from dualslam.core.estimates import ReadoutEstimate
 from dualslam.core.firsts import rank_in_runs
 from dualslam.core.geometry import se3
 from dualslam.core.geometry.projection import project_points, projection_jacobians
-from dualslam.core.noise_model import MIN_DEPTH_MU, PROOF_VIEWS
+from dualslam.core.noise_model import DAMPING, MIN_DEPTH_MU, PROOF_VIEWS, ROBUST_K
 from dualslam.core.robust import huber_weights
 from dualslam.core.types import BoolArray, Failure, FailureReason, FloatArray, IntArray
 from dualslam.map.submap import Submap
@@ -31,13 +31,9 @@ MIN_KEYFRAMES = 8
 PER_KEYFRAME = 150
 """Observations of each, of the landmarks with the longest tracks: they tell, and bound the time (0.1 s)."""
 MIN_OBSERVATIONS = 500
-ROBUST_K = 0.8
-"""Huber's threshold, in sigmas: about twice what residuals are."""
 STEPS = 4
 """Gauss-Newton steps: the map is at its optimum without the readout time, and each step goes two thirds of what is
 left (1.4, 1.7, 1.9 of 1.95 ms)."""
-DAMPING = 1e-4
-"""Relative to the diagonal: what keeps depths without parallax, and the map's scale, where they are."""
 
 
 @dataclass(slots=True, eq=False)

@@ -29,8 +29,8 @@ MIN_SHIFT_PX = 3.0
 models get wrong. Only there can a readout be separated from these, and only there does it matter."""
 LAG, SPACING = 3, 3
 """Frames between the views of a pair, far enough for the turn to change; and between pairs, which do not overlap."""
-SUSPICION = 1 / 9
-"""Share of the evidence that makes a rolling shutter likely: one sigma of three."""
+SUSPICION = 1 / GATE_SIGMAS**2
+"""Share of the evidence that makes a rolling shutter likely: one sigma of those of a gate."""
 MAX_PAIRS = 60
 """Pairs after which a readout time is taken, however unsure: waiting costs more then."""
 ENOUGH_PAIRS, ENOUGH_CURVATURE = 150, 50.0

@@ -10,6 +10,7 @@ from pydantic import Field, model_validator
 from dualslam.core.config.calibration_config import CalibrationConfig
 from dualslam.core.config.corruption import Corruption
 from dualslam.core.config.strict_model import StrictModel as StrictModel  # part of this module, too
+from dualslam.core.noise_model import ROBUST_K
 
 
 class FrontendConfig(StrictModel):
@@ -200,7 +201,7 @@ class BufferConfig(StrictModel):
 class GraphConfig(StrictModel):
     """The factor graph of a submap and its solver."""
 
-    robust_k: float = Field(0.8, gt=0)
+    robust_k: float = Field(ROBUST_K, gt=0)
     """Huber threshold in sigmas: 1.345 keeps 95 % efficiency under Gaussian noise, 0.8 does where residuals are at
     0.6 of their sigmas, and 88 % where the sigmas are right."""
     max_keyframes: int = Field(150, ge=20, le=1000)

@@ -11,13 +11,12 @@ from pathlib import Path
 
 import numpy as np
 
+from dualslam.atlas.node_views import MIN_SHARED
 from dualslam.core.geometry import se3, so3
 from dualslam.core.types import FloatArray
 from dualslam.io.atomic import write_text
 from dualslam.io.export.decimals import decimals
 from dualslam.io.export.exported_map import ExportedMap
-
-MIN_SHARED = 30
 
 
 def write_g2o(exported: ExportedMap, out: Path) -> None:
