@@ -44,6 +44,12 @@ def job() -> RecoveryJob:
     return job
 
 
+@pytest.fixture(scope="module")
+def inline(job: RecoveryJob) -> RecoveryResult | Failure:
+    """The same job, pickled and done in this process."""
+    return run_recovery(pickle.loads(pickle.dumps(job)), MAKE_PARTS())
+
+
 def walking_desk(time_limit_s: float = PATIENCE_S, finish_wait_s: float = 0.0) -> WorkerDesk:
     return WorkerDesk([Lane("walks", (JobKind.WALK,), MAKE_HANDLERS, 1, time_limit_s)], finish_wait_s)
 
@@ -119,10 +125,10 @@ def test_frames_that_came_too_late_are_posed_by_reverse_tracking() -> None:
 
 
 @pytest.mark.slow
-def test_a_job_can_be_pickled_and_is_left_as_it_was(job: RecoveryJob) -> None:
+def test_a_job_can_be_pickled_and_is_left_as_it_was(job: RecoveryJob, inline: RecoveryResult | Failure) -> None:
     before = job.submap.copy()
     here = run_recovery(job, MAKE_PARTS())
-    assert_same(here, run_recovery(pickle.loads(pickle.dumps(job)), MAKE_PARTS()))
+    assert_same(here, inline)
     assert isinstance(here, RecoveryResult)
     assert len(here.submap.keyframes) > len(before.keyframes)
     assert list(job.submap.keyframes) == list(before.keyframes)
@@ -131,11 +137,13 @@ def test_a_job_can_be_pickled_and_is_left_as_it_was(job: RecoveryJob) -> None:
 
 
 @pytest.mark.slow
-def test_a_worker_finds_what_would_be_found_inline_and_stays_warm(desk: WorkerDesk, job: RecoveryJob) -> None:
+def test_a_worker_finds_what_would_be_found_inline_and_stays_warm(
+    desk: WorkerDesk, job: RecoveryJob, inline: RecoveryResult | Failure
+) -> None:
     pids = desk.pids
     for _ in range(2):
         desk.submit(JobKind.WALK, job)
-        assert_same(wait_for(desk), run_recovery(job, MAKE_PARTS()))
+        assert_same(wait_for(desk), inline)
     assert desk.pids == pids
     assert desk.drain(JobKind.WALK) == []
     desk.close()
