@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
 
 from dualslam.core.types import BoolArray, FloatArray, IntArray
 
@@ -50,9 +50,5 @@ class BundleResult:
     cost_after: float
 
 
-class BundleAdjuster(Protocol):
-    """Batch bundle adjustment, robust. Raises `SolverError` where the solver fails."""
-
-    def __call__(self, problem: BundleProblem) -> BundleResult:
-        """Adjust all poses that are not fixed, and all points."""
-        ...
+BundleAdjuster = Callable[[BundleProblem], BundleResult]
+"""Adjusts all poses that are not fixed, and all points, robustly. Raises `SolverError` where the solver fails."""

@@ -158,21 +158,19 @@ N_WINDOW = 3
 """Newest keyframes that the tracking has a window move: those that it goes on from."""
 
 
-class WindowSolver(Protocol):
-    """Poses a new keyframe by a small bundle: what tracking goes on from until the graph has looked at it."""
+WindowSolver = Callable[["Submap", list[int]], GraphEstimate | Failure]
+"""Poses a new keyframe by a small bundle: what tracking goes on from until the graph has looked at it.
 
-    def __call__(self, submap: Submap, free_keyframes: list[int]) -> GraphEstimate | Failure:
-        """Adjust a few keyframes, the newest first, and the points that the newest sees; the submap is not changed.
-
-        Keyframes of the submap's gauge stay where they are. `GraphEstimate.outlier_rows` are of the newest keyframe.
-        """
-        ...
+It adjusts a few keyframes, the newest first, and the points that the newest sees; the submap is not changed. Keyframes
+of the submap's gauge stay where they are. `GraphEstimate.outlier_rows` are of the newest keyframe.
+"""
 
 
-class RowFollower(Protocol):
-    """Whatever knows observations of a submap by the numbers of their rows, from one change of the submap to the next.
+class SubmapGraph(Protocol):
+    """The factor graph of one submap. The submap's arrays are the record, the graph follows them.
 
-    One that finds that rows have gone which it was not asked about (`Submap.n_dropped`) makes its state anew.
+    It knows observations by the numbers of their rows. One that finds that rows have gone which it was not asked about
+    (`Submap.n_dropped`) makes its state anew.
     """
 
     def rows_out(self, submap: Submap) -> IntArray:
@@ -182,10 +180,6 @@ class RowFollower(Protocol):
     def keep_rows(self, rows: IntArray) -> None:
         """Take in that only these rows have stayed in the table, in their order (`Submap.keep_observations`)."""
         ...
-
-
-class SubmapGraph(RowFollower, Protocol):
-    """The factor graph of one submap. The submap's arrays are the record, the graph follows them."""
 
     def update(self, submap: Submap) -> GraphEstimate:
         """Take in what changed in the submap since the last call (rows added, rows that died) and solve."""
@@ -208,25 +202,15 @@ class SubmapGraph(RowFollower, Protocol):
         ...
 
 
-class SelfCalibrator(Protocol):
-    """Asks a submap about its camera, which is the one that rectified its features. The submap is not changed."""
+SelfCalibrator = Callable[["Submap", "Camera", FloatArray | None], CalibrationEstimate | Failure]
+"""Asks a submap about its camera, which is the one that rectified its features. The submap is not changed.
 
-    def __call__(
-        self, submap: Submap, camera: Camera, present_covariance: FloatArray | None
-    ) -> CalibrationEstimate | Failure:
-        """Estimate the correction of the calibration that was given, or say why it cannot be had.
+It returns the correction of the calibration that was given, or why it cannot be had. It takes the covariance (5, 5) of
+the correction that the camera has, if it was estimated.
+"""
 
-        `present_covariance`: (5, 5), of the correction that the camera has, if it was estimated.
-        """
-        ...
-
-
-class SubmapAdjuster(Protocol):
-    """Refines all poses and points of a submap in place, in batch. Raises `SolverError` where the solver fails."""
-
-    def __call__(self, submap: Submap) -> None:
-        """Refine."""
-        ...
+SubmapAdjuster = Callable[["Submap"], None]
+"""Refines all poses and points of a submap in place, in batch. Raises `SolverError` where the solver fails."""
 
 
 class FinalRefiner(Protocol):

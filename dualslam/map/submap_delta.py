@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from dualslam.core.interfaces import RowFollower
+from dualslam.core.interfaces import SubmapGraph
 from dualslam.core.types import Features, FloatArray, IntArray, Keyframe
 from dualslam.map.anchors import Anchor, RelativePose
 from dualslam.map.submap import NO_LANDMARK, Submap
@@ -194,13 +194,13 @@ MIN_DEAD = 10_000
 log = logging.getLogger(__name__)
 
 
-def drop_dead_rows(submap: Submap, follower: RowFollower) -> int:
+def drop_dead_rows(submap: Submap, graph: SubmapGraph) -> int:
     """Take out of a submap's table the rows that are dead and followed no more, once they outnumber the live ones.
 
     The table is therefore never more than about twice as long as it must be. A drop costs a copy of the live rows; as
     many rows have come and died since the last one: a constant for each.
 
-    `follower`: all that follows this submap by the numbers of its rows. (One that does not hear of it makes its state
+    `graph`: all that follows this submap by the numbers of its rows. (One that does not hear of it makes its state
     anew.)
 
     Returns int: how many rows have gone.
@@ -209,13 +209,13 @@ def drop_dead_rows(submap: Submap, follower: RowFollower) -> int:
     least = max(MIN_DEAD, n_alive + 1)
     if n - n_alive < least:  # at most frames: the follower is not asked
         return 0
-    rows = follower.rows_out(submap)
+    rows = graph.rows_out(submap)
     if len(rows) < least:
         return 0
     stays = np.ones(n, np.bool_)
     stays[rows] = False
     kept = np.flatnonzero(stays)
     submap.keep_observations(kept)
-    follower.keep_rows(kept)
+    graph.keep_rows(kept)
     log.info("submap %d: %d of %d observations were dead and have left the table", submap.id, len(rows), n)
     return len(rows)

@@ -18,8 +18,8 @@ from dualslam.recovery.job import FoundLink, RecoveryParts
 from dualslam.recovery.walk import Walk
 
 ENOUGH = 10
-"""Times the keyframes that a link needs, of a lost map's healthy ones that a walk holds when its last try to link them
-is made. A walk that fits none of so many is bent, and going on bends it further."""
+"""Times the keyframes that a link needs. With so many healthy ones of a lost map a walk makes its last try: one that
+fits none of them is bent, and going on bends it further."""
 
 Linker = Callable[[Submap, Submap, int | None], LinkEstimate | Failure]
 
