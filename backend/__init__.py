@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from dualslam.backend.final_refinement import refine_submap
     from dualslam.backend.local_ba import SubmapBundle, bundle_adjust, bundle_adjust_arrays
     from dualslam.backend.self_calibration import estimate_calibration
-    from dualslam.backend.sim3_graph import Sim3Edge, Sim3Prior, Sim3Solution, optimise_sim3
+    from dualslam.backend.sim3_graph import Sim3Edge, Sim3Solution, optimise_sim3
     from dualslam.backend.submap_graph import ISam2SubmapGraph
     from dualslam.backend.window import NumpyWindowSolver
 
@@ -21,7 +21,6 @@ _WHERE = {
     "GtsamAtlasSolver": "atlas_solver",
     "ISam2SubmapGraph": "submap_graph",
     "Sim3Edge": "sim3_graph",
-    "Sim3Prior": "sim3_graph",
     "Sim3Solution": "sim3_graph",
     "SubmapBundle": "local_ba",
     "NumpyWindowSolver": "window",
@@ -37,7 +36,6 @@ __all__ = [
     "ISam2SubmapGraph",
     "NumpyWindowSolver",
     "Sim3Edge",
-    "Sim3Prior",
     "Sim3Solution",
     "SubmapBundle",
     "bundle_adjust",

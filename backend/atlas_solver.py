@@ -16,7 +16,7 @@ import numpy as np
 
 from dualslam.backend.edge_covariance import edge_covariances
 from dualslam.backend.point_refinement import refit_points
-from dualslam.backend.sim3_graph import Sim3Edge, Sim3Prior, Sim3Solution, optimise_sim3
+from dualslam.backend.sim3_graph import Sim3Edge, Sim3Solution, optimise_sim3
 from dualslam.core.atlas_problem import AtlasProblem, AtlasSolution
 from dualslam.core.chi_square import CHI2_99, MEDIAN_CHI2, squared_distances
 from dualslam.core.errors import SolverError
@@ -127,8 +127,8 @@ class _Graph:
         chosen = [e for e, kept in zip(self.edges, believed.tolist(), strict=True) if kept]
         start = self.nodes if nodes is None else nodes
         fixed = self.problem.fixed
-        priors = {fixed: Sim3Prior(self.nodes[fixed])}
-        return optimise_sim3(start, chosen, priors, max_iterations=MAX_ITERATIONS, settled_cost=SETTLED_COST)
+        held = {fixed: self.nodes[fixed]}
+        return optimise_sim3(start, chosen, held, max_iterations=MAX_ITERATIONS, settled_cost=SETTLED_COST)
 
     def pieces(self, kept: BoolArray) -> IntArray:
         """Return for each node the piece that it belongs to: the lowest node of it."""
@@ -271,8 +271,8 @@ class _Graph:
         asked = list(self.edges)
         for i, C in zip(tested.tolist(), covariances, strict=True):
             asked[i] = replace(asked[i], covariance=C, doubtful=True)
-        priors = {self.problem.fixed: Sim3Prior(self.nodes[self.problem.fixed])}
-        return optimise_sim3(solution.S_world_node, asked, priors, robust=True).inliers
+        held = {self.problem.fixed: self.nodes[self.problem.fixed]}
+        return optimise_sim3(solution.S_world_node, asked, held, robust=True).inliers
 
 
 def _root(parent: list[int], i: int) -> int:

@@ -47,14 +47,6 @@ class Sim3Edge:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Sim3Prior:
-    """Prior of one node; `covariance` as in `Sim3Edge`, None fixes the node."""
-
-    S_world_node: FloatArray
-    covariance: FloatArray | None = None
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class Sim3Solution:
     """The optimum of a graph over Sim(3).
 
@@ -69,18 +61,6 @@ class Sim3Solution:
     cost_after: float
     _graph: gtsam.NonlinearFactorGraph = field(repr=False)
     _values: gtsam.Values = field(repr=False)
-
-    def covariances(self, nodes: Sequence[int]) -> FloatArray:
-        """Return (N, 7, 7) marginal covariances of ``S_world_node`` (right perturbation; in each node's own frame).
-
-        Raises `SolverError` if the solver cannot tell.
-        """
-        try:
-            marginals = gtsam.Marginals(self._graph, self._values)
-            found = [np.asarray(marginals.marginalCovariance(int(n)), float) for n in nodes]
-        except GTSAM_ERRORS as error:
-            raise SolverError(f"no covariances of Sim(3) nodes {list(nodes)[:5]}: {SolverFailure.of(error)}") from error
-        return np.array(found).reshape(-1, 7, 7)
 
     def relative_covariances(self, pairs: Sequence[tuple[int, int]]) -> FloatArray:
         """Return (P, 7, 7) covariances of ``inv(S_world_first) @ S_world_second``: right perturbation, second's frame.
@@ -110,21 +90,22 @@ class Sim3Solution:
 def optimise_sim3(
     nodes: Mapping[int, FloatArray],
     edges: Sequence[Sim3Edge],
-    priors: Mapping[int, Sim3Prior] | None = None,
+    fixed: Mapping[int, FloatArray] | None = None,
     robust: bool = False,
     max_iterations: int = 50,
     settled_cost: float = 0.0,
 ) -> Sim3Solution:
     """Find the similarities that agree best with the edges.
 
-    A piece of the graph without a prior keeps its lowest node where it is: there is always a gauge.
+    A piece of the graph without a fixed node keeps its lowest one where it is: there is always a gauge.
 
     Parameters
     ----------
     nodes : mapping of int to (4, 4)
         Initial ``S_world_node``.
     edges : sequence of Sim3Edge
-    priors : mapping of int to Sim3Prior, optional
+    fixed : mapping of int to (4, 4), optional
+        Nodes that are held, and where.
     robust : bool
         Let graduated non-convexity choose among the doubtful edges; else all edges count.
     max_iterations : int
@@ -135,25 +116,24 @@ def optimise_sim3(
     Raises
     ------
     SolverError
-        If an edge or prior names a node that is not there, a similarity is not one, or the solver fails.
+        If an edge or `fixed` names a node that is not there, a similarity is not one, or the solver fails.
     """
-    priors = dict(priors or {})
+    held = dict(fixed or {})
     if not nodes:
         raise SolverError("a graph over Sim(3) needs at least one node")
-    for name in [n for e in edges for n in (e.first, e.second)] + list(priors):
+    for name in [n for e in edges for n in (e.first, e.second)] + list(held):
         if name not in nodes:
-            raise SolverError(f"an edge or prior names Sim(3) node {name}, which is not in the graph")
-    for lonely in _pieces_without_prior(np.array(sorted(nodes), np.int64), edges, priors):
-        priors[lonely] = Sim3Prior(nodes[lonely])
+            raise SolverError(f"an edge or a fixed node names Sim(3) node {name}, which is not in the graph")
+    for lonely in _loose_pieces(np.array(sorted(nodes), np.int64), edges, held):
+        held[lonely] = nodes[lonely]
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
     try:
         for e in edges:
             S = convert.to_similarity3(e.S_first_second)
             graph.push_back(gtsam.BetweenFactorSimilarity3(int(e.first), int(e.second), S, gaussian(e.covariance)))
-        for name, prior in priors.items():
-            covariance = GAUGE_SIGMA**2 * np.eye(7) if prior.covariance is None else prior.covariance
-            S = convert.to_similarity3(prior.S_world_node)
-            graph.push_back(gtsam.PriorFactorSimilarity3(int(name), S, gaussian(covariance)))
+        gauge = gaussian(GAUGE_SIGMA**2 * np.eye(7))
+        for name, S_world_node in held.items():
+            graph.push_back(gtsam.PriorFactorSimilarity3(int(name), convert.to_similarity3(S_world_node), gauge))
         for name, S_world_node in nodes.items():
             values.insert(int(name), convert.to_similarity3(S_world_node))
         inliers = np.ones(len(edges), bool)
@@ -209,12 +189,12 @@ def _without(graph: gtsam.NonlinearFactorGraph, indices: IntArray) -> gtsam.Nonl
     return kept
 
 
-def _pieces_without_prior(nodes: IntArray, edges: Sequence[Sim3Edge], priors: Mapping[int, Sim3Prior]) -> list[int]:
-    """Return the lowest node of each connected piece that no prior holds (doubtful edges do not connect)."""
+def _loose_pieces(nodes: IntArray, edges: Sequence[Sim3Edge], fixed: Mapping[int, FloatArray]) -> list[int]:
+    """Return the lowest node of each connected piece without a fixed one (doubtful edges do not connect)."""
     sure = [(e.first, e.second) for e in edges if not e.doubtful]
     n = len(edges)
     node = np.concatenate([nodes, np.array(sure, np.int64).ravel()])
     through = np.concatenate([n + np.arange(len(nodes)), np.repeat(np.arange(len(sure)), 2)])
     ids, label = find_components(node, through)
-    held = set(label[np.isin(ids, list(priors))].tolist())
+    held = set(label[np.isin(ids, list(fixed))].tolist())
     return [int(ids[label == piece].min()) for piece in np.unique(label).tolist() if piece not in held]

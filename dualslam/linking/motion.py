@@ -74,16 +74,15 @@ class Motion:
         return self.off_mu > self.allowed_mu
 
 
-def measure_motion(path: Path, last_before: int, known: Path, slack_mu: float = 0.0) -> Motion | None:
+def measure_motion(path: Path, last_before: int, known: Path) -> Motion | None:
     """Compare the displacement behind a frame of a path with what its velocities predict.
 
     - `last_before`: row of the last frame before the gap, or before the seam.
     - `known`: the camera's path where the usual error is measured, in the unit of `path`.
-    - `slack_mu`: what the join of two maps leaves open.
 
     Returns Motion or None: none where neither side has a velocity.
     """
-    return _measure(_Fits.of(path), last_before, _Fits.of(known), slack_mu)
+    return _measure(_Fits.of(path), last_before, _Fits.of(known))
 
 
 def step_motions(path: Path, rows: IntArray, known: Path) -> Iterator[Motion]:
