@@ -51,6 +51,6 @@ DAMPING = 1e-4
 """Of normal equations, relative to the diagonal: keeps where it is what nothing fixes."""
 MAX_TRIES = 3
 """Times that what fails by chance is tried in vain before it counts as broken."""
-UNSURE_SCALE = 0.07
-"""Standard deviation of the logarithm of a stretch's scale against that of its submap: with more it is off by 15 % with
-a probability above 5 %. What is off by so much is too large or too small to be measured in."""
+UNSURE_SCALE = 0.1
+"""Standard deviation of the logarithm of the size of two seconds of the path: with more it is off by 20 % with a
+probability above 5 %. What is off by so much is too large or too small to be measured in."""

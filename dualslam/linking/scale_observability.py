@@ -5,6 +5,9 @@ two places the scale is handed on from landmark to landmark. If few are shared, 
 of it arrives. How much is known of it stands in the normal equations of the map: all poses and points between the
 places are unknown together. The result is the ratio of the scales at which the cameras of either place see their
 points. That ratio does not depend on the gauge.
+
+The same equations tell how well the size of the camera's path is known. It can be unsure where depths are firm: few
+landmarks, or a short way against their depth, fix how far the camera is from them, but not how far it has gone.
 """
 
 from __future__ import annotations
@@ -35,6 +38,9 @@ SLACK = 1e-12
 """Relative to a block of the normal equations: what keeps a point without parallax from being singular."""
 NO_TIE = 1e-7
 """Relative to the median stiffness: directions that are softer than this are as free as the gauge."""
+MIN_SIZE = 0.25
+"""Of the median stretch's size: the error of smaller ones is counted against this. A camera at rest has no path that
+could have a wrong size."""
 
 
 def scale_sigma_between(submap: Submap, here: IntArray, there: IntArray) -> float:
@@ -60,10 +66,35 @@ def scale_sigmas_in_all(
 
     `excess`: of `noise_excess`.
     """
+    return [SCALE_INFLATION * sigma for sigma in answer_scale(_ask_all(submap, places, excess))]
+
+
+def path_sigmas(submap: Submap, stretches: Sequence[IntArray], excess: Mapping[int, float]) -> FloatArray:
+    """Return the standard deviations (S,) of the log of the size of stretches of the path, against the whole path's.
+
+    The size is the RMS distance of a stretch's keyframes from their centre. Infinite where nothing ties a stretch to
+    the rest.
+
+    - `stretches`: keyframe ids of each, two at least.
+    - `excess`: of `noise_excess`.
+    """
+    ids = np.array(sorted(submap.keyframes), np.int64)
+    problem = _linearise(_ask_all(submap, [(ids, ids)], excess))
+    if problem is None:
+        return np.full(len(stretches), np.inf)
+    free, root = _directions(problem.reduced)
+    of_whole, _ = _size_at(problem, ids)
+    g, sizes = (np.array(x) for x in zip(*(_size_at(problem, part) for part in stretches), strict=True))
+    g = (g - of_whole) * (sizes / np.maximum(sizes, MIN_SIZE * np.median(sizes)))[:, None]
+    sigmas = SCALE_INFLATION * np.sqrt(COVARIANCE_INFLATION * ((g @ root) ** 2).sum(1))
+    return np.where(((g @ free) ** 2 > SLACK).any(1), np.inf, sigmas)
+
+
+def _ask_all(submap: Submap, places: Sequence[tuple[IntArray, IntArray]], excess: Mapping[int, float]) -> ScaleQuestion:
+    """Ask all that a submap has seen, each keyframe with its own noise."""
     question = ask_scale(submap, places, n_around=len(submap.keyframes))
     noise = np.array([excess[k] for k in question.ids.tolist()])[question.kf]
-    sigmas = answer_scale(replace(question, sigma_px=noise * question.sigma_px))
-    return [SCALE_INFLATION * sigma for sigma in sigmas]
+    return replace(question, sigma_px=noise * question.sigma_px)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -108,12 +139,23 @@ def answer_scale(question: ScaleQuestion) -> list[float]:
     problem = _linearise(question)
     if problem is None:
         return [np.inf] * len(question.places)
-    values, vectors = np.linalg.eigh(problem.reduced)
-    return [_sigma(problem, values, vectors, here, there) for here, there in question.places]
+    free, root = _directions(problem.reduced)
+    return [_sigma(problem, free, root, here, there) for here, there in question.places]
 
 
-def _sigma(problem: _Problem, values: FloatArray, vectors: FloatArray, here: IntArray, there: IntArray) -> float:
-    """Ask the normal equations, whose reduced part has these eigenvalues and eigenvectors, for one pair of places."""
+def _directions(reduced: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the directions of the poses (6 F, n) that nothing fixes, and a root of the covariance of the others.
+
+    The gauge's directions are in neither.
+    """
+    values, vectors = np.linalg.eigh(reduced)
+    stiff = values[N_GAUGE:] > NO_TIE * float(np.median(values))
+    vectors = vectors[:, N_GAUGE:]
+    return vectors[:, ~stiff], vectors[:, stiff] / np.sqrt(values[N_GAUGE:][stiff])
+
+
+def _sigma(problem: _Problem, free: FloatArray, root: FloatArray, here: IntArray, there: IntArray) -> float:
+    """Ask the normal equations, with their `_directions`, for one pair of places."""
     g = [_scale_at(problem, ids) for ids in (there, here)]
     if g[0] is None or g[1] is None:
         return np.inf
@@ -121,14 +163,9 @@ def _sigma(problem: _Problem, values: FloatArray, vectors: FloatArray, here: Int
     # The points are eliminated: what remains of the functional is one of the poses.
     through = np.einsum("nij,nj->ni", problem.inverse, g_point)
     g_pose = g_pose - problem.H_cross @ through.reshape(-1)
-    along = vectors.T @ g_pose
-    stiff = values > NO_TIE * float(np.median(values))
-    stiff[:N_GAUGE] = False
-    free = ~stiff
-    free[:N_GAUGE] = False
-    if (along[free] ** 2 > SLACK).any():
+    if ((g_pose @ free) ** 2 > SLACK).any():
         return np.inf
-    variance = float((g_point * through).sum() + (along[stiff] ** 2 / values[stiff]).sum())
+    variance = float((g_point * through).sum() + ((g_pose @ root) ** 2).sum())
     return float(np.sqrt(COVARIANCE_INFLATION * max(variance, 0.0)))
 
 
@@ -203,3 +240,15 @@ def _scale_at(problem: _Problem, ids: IntArray) -> tuple[FloatArray, FloatArray]
     g_pose = sum_by(kf, share[:, None] * by_pose, len(problem.ids))
     g_point = sum_by(point, share[:, None] * by_point, len(problem.xyz))
     return g_pose.reshape(-1), g_point
+
+
+def _size_at(problem: _Problem, ids: IntArray) -> tuple[FloatArray, float]:
+    """Return the derivative (6 F,) of the log of the path's size at some keyframes by the poses, and the size."""
+    rows = np.searchsorted(problem.ids, ids)
+    T = problem.T_cam_submap[rows]
+    offset = se3.inverse(T)[:, :3, 3]
+    offset = offset - offset.mean(axis=0)
+    squares = max(float((offset**2).sum()), np.finfo(float).tiny)
+    by_pose = np.zeros((len(problem.ids), 6))
+    by_pose[rows, 3:] = -np.einsum("nij,nj->ni", T[:, :3, :3], offset) / squares
+    return by_pose.reshape(-1), float(np.sqrt(squares / len(ids)))

@@ -37,8 +37,8 @@ def trust_section(run: RunData) -> Markup:
         _strip(
             run,
             [row.sigma_scale for row in run.rows],
-            "sigma of the scale at a frame, against that of its submap",
-            "Above it what lies there may be 15 % too large or too small.",
+            "sigma of the size of two seconds of the path, against the whole",
+            "Above it they may be 20 % too large or too small.",
             UNSURE_SCALE,
         ),
         _strip(

@@ -6,19 +6,23 @@ or posed again later. A frame claims what the keyframe does that it hangs on.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from dualslam.atlas.atlas import Atlas
 from dualslam.core.geometry import se3
 from dualslam.core.noise_model import GROUP
-from dualslam.core.types import FloatArray
-from dualslam.linking.scale_observability import scale_sigmas_in_all
+from dualslam.core.types import FloatArray, IntArray
+from dualslam.linking.scale_observability import path_sigmas
 from dualslam.map.landmark_views import landmark_covariances, noise_excess, resection_covariance
 from dualslam.map.submap import Submap
 
 POSITION_INFLATION = 1.1
 """As `SCALE_INFLATION` (`linking/scale_observability.py`), for positions."""
+STRETCH_S = 2.0
+"""Seconds of a path whose size is asked for, about a keyframe. It has `GROUP` keyframes at least."""
 NEAR = 2
 """Keyframes before and after by whose residuals, too, a position is judged: it is one against what they hold. The first
 after a blurred stretch see sharply what the blurred ones have placed."""
@@ -31,12 +35,42 @@ class Claim:
     sigma_position_rel: float
     """Standard deviation of the position against what the keyframe sees, over the median depth of that."""
     sigma_scale: float
-    """Standard deviation of the logarithm of the scale at the keyframe against that of its whole submap: by how much
-    what lies there may be too large or too small. Infinite where nothing ties it to the rest."""
+    """Standard deviation of the logarithm of the size of the path about the keyframe, against that of the whole path:
+    by how much it may be too large or too small. Infinite where nothing ties it to the rest."""
+
+
+def claims_in_atlas(atlas: Atlas) -> dict[int, dict[int, Claim]]:
+    """Return the claims of all submaps, with their scales against the largest submap that each is linked to."""
+    claims = {m: claims_of(submap) for m, submap in atlas.submaps.items()}
+    for component in atlas.components():
+        variance = _scale_variances(atlas, component, claims)
+        for m in component:
+            for k, claim in claims[m].items():
+                claims[m][k] = replace(claim, sigma_scale=float(np.sqrt(claim.sigma_scale**2 + variance[m])))
+    return claims
+
+
+def _scale_variances(atlas: Atlas, component: list[int], claims: Mapping[int, Mapping[int, Claim]]) -> dict[int, float]:
+    """Return the variance of the log of each submap's scale against the largest's, along the best links.
+
+    A link is measured at one place of either submap. How well the scale is known there adds to its own variance.
+    """
+    steps = []
+    for link in atlas.believed:
+        if link.a != link.b and link.a in component:
+            at = zip((link.a, link.b), link.attached(atlas), strict=True)
+            sigmas = [link.sigma_scale, *(claims[m][k].sigma_scale for m, k in at)]
+            steps.append((link.a, link.b, float(np.nansum(np.square(sigmas)))))
+    largest = max(component, key=lambda m: len(atlas.submaps[m].keyframes))
+    variance = {m: 0.0 if m == largest else np.inf for m in component}
+    for _ in component:
+        for a, b, more in steps:
+            variance[a], variance[b] = min(variance[a], variance[b] + more), min(variance[b], variance[a] + more)
+    return variance
 
 
 def claims_of(submap: Submap) -> dict[int, Claim]:
-    """Return what a submap claims of its keyframes."""
+    """Return what a submap claims of its keyframes, with their scales against its own whole path."""
     excess = noise_excess(submap)
     ids = sorted(submap.keyframes)
     scale, covariances = _scale_sigmas(submap, excess), landmark_covariances(submap, np.arange(len(submap.landmarks)))
@@ -62,10 +96,18 @@ def _position_sigma(submap: Submap, keyframe_id: int, covariances: FloatArray) -
 
 
 def _scale_sigmas(submap: Submap, excess: dict[int, float]) -> dict[int, float]:
-    """Ask for each group of keyframes how well its scale is known against that of the whole map."""
+    """Ask for the stretch about each keyframe how well its size is known against that of the whole path."""
+    stretches = stretches_of(submap)
+    if len(stretches) <= GROUP or not submap.landmarks["alive"].any():
+        return dict.fromkeys(stretches, float("nan"))
+    sigmas = path_sigmas(submap, list(stretches.values()), excess)
+    return dict(zip(stretches, sigmas.tolist(), strict=True))
+
+
+def stretches_of(submap: Submap) -> dict[int, IntArray]:
+    """Return the keyframes of the stretch about each keyframe, by whose size its scale is judged."""
     ids = np.array(sorted(submap.keyframes), np.int64)
-    groups = [ids[begin : begin + GROUP] for begin in range(0, len(ids), GROUP)]
-    can_tell = len(groups) > 1 and bool(submap.landmarks["alive"].any())
-    places = [(group, ids) for group in groups]
-    sigmas = scale_sigmas_in_all(submap, places, excess) if can_tell else [np.nan] * len(groups)
-    return {k: sigma for group, sigma in zip(groups, sigmas, strict=True) for k in group.tolist()}
+    times_s = np.array([submap.keyframes[k].timestamp_s for k in ids.tolist()])
+    near = np.abs(np.subtract.outer(times_s, times_s)) <= STRETCH_S / 2.0
+    near |= np.abs(np.subtract.outer(np.arange(len(ids)), np.arange(len(ids)))) <= GROUP // 2
+    return {k: ids[row] for k, row in zip(ids.tolist(), near, strict=True)}

@@ -26,6 +26,9 @@ MIN_JUMP_DEPTHS = 0.02
 """Length of a jump over the median depth of the scene: shorter ones are noise of single frames."""
 MIN_COVERAGE = 0.95
 """Share of the frames that can be posed."""
+MAX_UNSURE = 0.1
+"""Share of frames with an unsure scale. Where a camera turns on the spot, two seconds have no size to speak of: right
+runs of a hand-held camera that mostly turns have up to 6 %."""
 MIN_COMPARED = 5
 """Keyframes by which two maps are compared: a similarity alone fits two of them, and most paths of three."""
 STOOD_S = 1.0
@@ -177,15 +180,15 @@ def _photometric(system: System, found: Disagreement) -> list[Reason]:
 
 
 def _scale(rows: Sequence[FrameRow]) -> list[Reason]:
-    """Return where the scale is unsure, if that is at more frames than may be missing."""
+    """Return where the scale is unsure, if that is at many frames."""
     known = {row.index: row.sigma_scale for row in rows if row.in_main_map and row.sigma_scale is not None}
     unsure = sorted(index for index, sigma in known.items() if sigma > UNSURE_SCALE)
-    if len(unsure) <= (1.0 - MIN_COVERAGE) * len(known):
+    if len(unsure) <= MAX_UNSURE * len(known):
         return []
     first, last = _longest_run(unsure)
     text = (
-        f"The scale of {len(unsure)} frames, mostly {first} to {last}, is hardly tied to that of the others: "
-        "what lies there may be 15 % too large or too small. "
+        f"The size of the path at {len(unsure)} frames, mostly {first} to {last}, is hardly tied to that of the rest: "
+        "it may be 20 % too large or too small. "
         "Too little is seen from both sides. Move sideways there, turn more slowly, or come back to the place."
     )
     return [Reason(ReasonCode.SCALE, Level.USABLE, text, first, last)]

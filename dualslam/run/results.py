@@ -25,7 +25,7 @@ from dualslam.io.run_folder import FrameRow
 from dualslam.io.trajectory_files import MAX_DT_S, Trajectory, associate
 from dualslam.lab.metrics.trajectory_metrics import score_trajectory
 from dualslam.recovery.frame_buffer import MB
-from dualslam.run.claims import Claim, claims_of
+from dualslam.run.claims import Claim, claims_in_atlas
 from dualslam.run.runner import RunReport
 from dualslam.system.audit.verdict import Verdict
 from dualslam.system.system import System
@@ -87,7 +87,7 @@ def frame_rows(
         Of the frames that were tracked, by their index, as the harness measured them. Else that of their steps.
     """
     in_main = set((trajectories_of(system).main if main is None else main).index.tolist())
-    claims = {m: claims_of(submap) for m, submap in system.atlas.submaps.items()}
+    claims = claims_in_atlas(system.atlas)
     return [
         replace(
             _with_claim(system, row, claims),

@@ -12,13 +12,20 @@ from dualslam.core.config.settings import GraphConfig, LinkingConfig
 from dualslam.core.geometry import se3
 from dualslam.core.noise_model import GATE_SIGMAS
 from dualslam.core.types import Failure, FailureReason, FloatArray, IntArray
-from dualslam.linking import DescriptorMatcher, LinkEstimate, estimate, estimate_link, propagate_to_live_end
+from dualslam.linking import (
+    DescriptorMatcher,
+    LinkEstimate,
+    estimate,
+    estimate_link,
+    propagate_to_live_end,
+    scale_observability,
+)
 from dualslam.linking.correspondences import propose_correspondences
 from dualslam.linking.estimate import LinkRefusal
 from dualslam.linking.gates import MIN_TIES, MINORITY_DEFORMATION
 from dualslam.linking.join_test import LinkEvidence
 from dualslam.linking.pairs import PairModel
-from dualslam.linking.scale_observability import scale_sigma_between
+from dualslam.linking.scale_observability import path_sigmas, scale_sigma_between, scale_sigmas_in_all
 from dualslam.linking.verify import judge_parting
 from dualslam.map.solving import solve
 from dualslam.map.submap import Submap
@@ -40,6 +47,7 @@ CONFIG = LinkingConfig()
 MATCHER = DescriptorMatcher(hamming, 64.0)
 N = 24
 HERE, THERE = FRAME_STEP * np.arange(4), FRAME_STEP * np.arange(20, 24)
+EXACT = dict.fromkeys((FRAME_STEP * np.arange(N)).tolist(), 1.0)
 
 
 def solved(layout: str, seed: int) -> tuple[World, Submap]:
@@ -63,14 +71,46 @@ def log_scale(world: World, submap: Submap, ids: IntArray) -> float:
     return float(np.median(np.concatenate(ratios)))
 
 
+def log_size(world: World, submap: Submap, ids: IntArray) -> float:
+    """Return the log of the size of the path at some keyframes, against the truth."""
+    centres = submap.keyframe_poses(ids)[:, :3, 3], world.T_w_cam[ids // FRAME_STEP, :3, 3]
+    own, true = (np.linalg.norm(c - c.mean(axis=0)) for c in centres)
+    return float(np.log(own / true))
+
+
 @pytest.mark.parametrize("layout", ["street", pytest.param("room", marks=pytest.mark.slow)])
 def test_the_sigma_is_that_of_the_error(layout: str) -> None:
-    whitened = []
+    of_depths, of_path = [], []
     for seed in range(8):
         world, submap = solved(layout, seed)
         sigma = scale_sigma_between(submap, HERE, THERE)
-        whitened.append((log_scale(world, submap, THERE) - log_scale(world, submap, HERE)) / sigma)
-    assert 0.2 < np.sqrt(np.mean(np.square(whitened))) < 2.0, whitened
+        of_depths.append((log_scale(world, submap, THERE) - log_scale(world, submap, HERE)) / sigma)
+        error = log_size(world, submap, THERE) - log_size(world, submap, np.array(sorted(submap.keyframes)))
+        of_path.append(error / path_sigmas(submap, [THERE], EXACT)[0])
+    assert 0.2 < np.sqrt(np.mean(np.square(of_depths))) < 2.0, of_depths
+    assert 0.2 < np.sqrt(np.mean(np.square(of_path))) < 2.0, of_path
+
+
+def test_the_way_can_be_unsure_where_the_depths_are_firm() -> None:
+    _, submap = solved("street", 0)
+    ids = np.array(sorted(submap.keyframes))
+    middle = ids[10:14]
+    noise = EXACT | dict.fromkeys(middle.tolist(), 10.0)
+    (depths,), (way,) = scale_sigmas_in_all(submap, [(middle, ids)], noise), path_sigmas(submap, [middle], noise)
+    assert depths < 0.005
+    assert way > 0.03
+    assert path_sigmas(submap, [middle], EXACT)[0] < way / 3
+
+
+def test_a_stretch_that_hardly_moves_is_counted_against_the_others_size(monkeypatch: pytest.MonkeyPatch) -> None:
+    _, submap = solved("street", 0)
+    ids = np.array(sorted(submap.keyframes))
+    stretches = [ids[10:12], ids[:12], ids[6:18], ids[12:]]
+    counted = path_sigmas(submap, stretches, EXACT)
+    monkeypatch.setattr(scale_observability, "MIN_SIZE", 0.0)
+    of_itself = path_sigmas(submap, stretches, EXACT)
+    assert counted[0] < of_itself[0]
+    assert counted[1:] == pytest.approx(of_itself[1:])
 
 
 def test_fewer_ties_hold_less_and_none_hold_nothing() -> None:
@@ -84,9 +124,10 @@ def test_fewer_ties_hold_less_and_none_hold_nothing() -> None:
 
 def test_the_unit_does_not_matter() -> None:
     _, submap = solved("room", 1)
-    before = scale_sigma_between(submap, HERE, THERE)
+    before = scale_sigma_between(submap, HERE, THERE), path_sigmas(submap, [THERE], EXACT)[0]
     submap.transform(7.0, se3.exp(np.array([0.3, -0.2, 0.5, 3.0, 1.0, -2.0])))
-    assert scale_sigma_between(submap, HERE, THERE) == pytest.approx(before, rel=1e-3)
+    after = scale_sigma_between(submap, HERE, THERE), path_sigmas(submap, [THERE], EXACT)[0]
+    assert after == pytest.approx(before, rel=1e-3)
 
 
 # --- the live end

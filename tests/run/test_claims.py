@@ -6,10 +6,12 @@ from dataclasses import replace
 from functools import cache
 
 import numpy as np
+import pytest
 
+from dualslam.atlas.atlas import Atlas, Link, LinkKind
 from dualslam.core.noise_model import GROUP
 from dualslam.map.submap import Submap
-from dualslam.run.claims import claims_of
+from dualslam.run.claims import claims_in_atlas, claims_of
 from dualslam.run.results import frame_rows, trajectories_of
 from dualslam.system.system import System
 from dualslam.testing.point_world import PointWorld, cloud, hand_held, system_in
@@ -90,3 +92,23 @@ def test_where_nothing_is_seen_on_both_sides_the_scale_is_not_known() -> None:
     held, cut = (claims_of(m)[ids[at]].sigma_scale for m in (submap, without_ties(submap, ids[at])))
     assert held < 0.05
     assert cut > 10 * held
+
+
+def test_the_scale_of_a_joined_map_is_told_against_the_larger_one_along_the_best_link() -> None:
+    submap = run()[0].atlas.submaps[0]
+    ids = sorted(submap.keyframes)
+    atlas = Atlas()
+    for m in range(3):
+        atlas.submaps[m] = submap.copy()
+    atlas.submaps[1].remove_keyframe(ids[-1], ids[-2])
+    own = claims_of(atlas.submaps[1])
+    assert claims_in_atlas(atlas)[1] == own
+    for sigma, at in ((0.2, ids[0]), (0.03, ids[3])):
+        C = sigma**2 * np.eye(7)
+        atlas.link(Link(0, 1, np.eye(4), C, LinkKind.LOOP, keyframe_a=at, keyframe_b=at))
+    claims = claims_in_atlas(atlas)
+    assert claims[0] == claims[2] == claims_of(submap)
+    of_link = np.hypot(0.03, np.hypot(claims[0][ids[3]].sigma_scale, own[ids[3]].sigma_scale))
+    assert [claims[1][k].sigma_scale for k in own] == pytest.approx(
+        [np.hypot(claim.sigma_scale, of_link) for claim in own.values()]
+    )
