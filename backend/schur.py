@@ -26,6 +26,8 @@ from dualslam.core.types import FloatArray, IntArray
 
 Loss = Callable[[FloatArray], tuple[FloatArray, FloatArray]]
 """Weights and losses of squared whitened residuals."""
+_Fit = tuple[FloatArray, FloatArray, FloatArray, FloatArray]
+"""Of a chunk's observations: points in their cameras (R, 3), whitened residuals (R, 2), weights and losses (R,)."""
 CHUNK, KEPT_CHUNKS = 8192, 4
 """Observations that are linearised at once, about 1 kB each. Up to so many chunks are kept through a step, 0.3 kB an
 observation; more are linearised twice."""
@@ -149,6 +151,7 @@ class System:
         self, problem: BundleProblem, loss: Loss, lens: Lens | None = None, behind_chi2: float = BEHIND_CHI2
     ) -> None:
         self._problem, self._loss, self._lens, self._behind_chi2 = problem, loss, lens, behind_chi2
+        self._fitted: tuple[State, list[_Fit]] | None = None
         self._rows = np.argsort(problem.point, kind="stable")
         n_views = np.bincount(problem.point, minlength=len(problem.xyz_mu))
         self._begin = np.concatenate([[0], np.cumsum(n_views)])  # of each point, among the rows
@@ -180,10 +183,18 @@ class System:
     def cost(self, state: State) -> float:
         """Return the sum of the losses, and the prior's."""
         prior = 0.0 if self._lens is None else 0.5 * float(state.lens @ self._lens.information @ state.lens)
-        return prior + sum(float(self._fit(chunk, state)[3].sum()) for chunk in self._chunks)
+        return prior + sum(float(losses.sum()) for *_, losses in self._fits(state))
 
-    def _fit(self, chunk: tuple[int, int], state: State) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Return points in their cameras (R, 3), whitened residuals (R, 2), weights and losses (R,)."""
+    def _fits(self, state: State) -> Iterable[_Fit]:
+        """Fit all chunks. A state whose cost was asked for last is the one that is linearised next: its fit is kept."""
+        if self._fitted is None or self._fitted[0] is not state:
+            fits = (self._fit(chunk, state) for chunk in self._chunks)
+            if len(self._chunks) > KEPT_CHUNKS:
+                return fits
+            self._fitted = state, list(fits)
+        return self._fitted[1]
+
+    def _fit(self, chunk: tuple[int, int], state: State) -> _Fit:
         p, rows = self._problem, self._rows_of(chunk)
         xyz_cam, front, uv_px = reproject(p.K, state.T_submap_kf, p.kf[rows], state.xyz_mu.take(p.point[rows], axis=0))
         xyz_cam = np.where(front[:, None], xyz_cam, [0.0, 0.0, 1.0])
@@ -197,9 +208,9 @@ class System:
     def _rows_of(self, chunk: tuple[int, int]) -> IntArray:
         return self._rows[self._begin[chunk[0]] : self._begin[chunk[1]]]
 
-    def _linearise(self, chunk: tuple[int, int], state: State) -> _Linear:
+    def _linearise(self, chunk: tuple[int, int], state: State, fit: _Fit) -> _Linear:
         p, rows = self._problem, self._rows_of(chunk)
-        xyz_cam, residuals, weight, _ = self._fit(chunk, state)
+        xyz_cam, residuals, weight, _ = fit
         R, sigma_px = state.T_submap_kf.take(p.kf[rows], axis=0)[:, :3, :3], p.sigma_px[rows]
         if self._lens is None:
             J_point = projection_jacobian(p.K, R, xyz_cam, sigma_px).transpose(2, 0, 1)
@@ -250,7 +261,8 @@ class System:
         return np.asarray(np.linalg.inv(solved[2]), np.float64)
 
     def _linear(self, state: State) -> Iterator[_Linear]:
-        return (self._linearise(chunk, state) for chunk in self._chunks)
+        fits = self._fits(state)
+        return (self._linearise(chunk, state, fit) for chunk, fit in zip(self._chunks, fits, strict=True))
 
     def _without_points(
         self, state: State, damping: float, linear: Iterable[_Linear]

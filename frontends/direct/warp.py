@@ -100,31 +100,42 @@ def sample(levels: Pyramid, uv_px: FloatArray, axes: FloatArray, half: int) -> N
     - `levels` (list of (H, W)), `uv_px` (N, 2).
     - `axes` (N, 2, 2): columns: steps in the image from one pixel of the patch to its right and lower neighbour.
     """
-    return sample_each([levels], np.zeros(len(uv_px), np.int64), uv_px, axes, half)
+    return Sampler([levels], np.zeros(len(uv_px), np.int64), axes, half)(uv_px)
 
 
-def sample_each(
-    images: Sequence[Pyramid], image_of: IntArray, uv_px: FloatArray, axes: FloatArray, half: int
-) -> NDArray[np.float32]:
-    """Return patches (N, S, S) as `sample` does, each of its own image: `image_of` (N,)."""
-    step = np.sqrt(np.abs(np.linalg.det(axes)))
-    highest = np.array([len(levels) - 1 for levels in images])[image_of]
-    level = np.clip(np.rint(np.log2(np.maximum(step, 1e-6))), 0, highest).astype(np.int64)
-    source = MAX_LEVELS * image_of + level
-    order = np.argsort(source, kind="stable")
-    # The middle of a level's first pixel is the middle of the image's.
-    shrunk = 2.0 ** level[order, None]
-    right, down = (axes[order] / shrunk[..., None]).transpose(2, 1, 0)[..., None, None]
-    side, grid = 2 * half + 1, np.arange(-half, half + 1, dtype=np.float64)
-    at = np.empty((2, len(order), side, side), np.float32)
-    np.add((uv_px[order] / shrunk).T[..., None, None] + right * grid, down * grid[:, None], out=at)
-    patches = np.empty((len(order), side, side), np.float32)
-    for begin, end in _runs(source[order], REMAP_ROWS // side):
-        of, n = divmod(int(source[order[begin]]), MAX_LEVELS)
-        u, v = at[:, begin:end].reshape(2, -1, side)
-        out = cv2.remap(images[of][n], u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        patches[order[begin:end]] = out.reshape(-1, side, side)
-    return patches
+class Sampler:
+    """Takes patches as `sample` does, each of its own image, at places that may change.
+
+    - `image_of` (N,): rows of `images`.
+    - `axes` (N, 2, 2), `half`: as for `sample`.
+    """
+
+    def __init__(self, images: Sequence[Pyramid], image_of: IntArray, axes: FloatArray, half: int) -> None:
+        step = np.sqrt(np.abs(np.linalg.det(axes)))
+        highest = np.array([len(levels) - 1 for levels in images])[image_of]
+        level = np.clip(np.rint(np.log2(np.maximum(step, 1e-6))), 0, highest).astype(np.int64)
+        source = MAX_LEVELS * image_of + level
+        self._order = np.argsort(source, kind="stable")
+        # The middle of a level's first pixel is the middle of the image's.
+        self._shrunk = 2.0 ** level[self._order, None]
+        right, down = (axes[self._order] / self._shrunk[..., None]).transpose(2, 1, 0)[..., None, None]
+        self._side, grid = 2 * half + 1, np.arange(-half, half + 1, dtype=np.float64)
+        self._right, self._down = right * grid, down * grid[:, None]
+        runs = _runs(source[self._order], REMAP_ROWS // self._side)
+        from_image = (divmod(int(source[self._order[begin]]), MAX_LEVELS) for begin, _ in runs)
+        self._runs = [(images[of][n], *run) for (of, n), run in zip(from_image, runs, strict=True)]
+
+    def __call__(self, uv_px: FloatArray) -> NDArray[np.float32]:
+        """Return patches (N, S, S) about places (N, 2)."""
+        n, side = len(self._order), self._side
+        at = np.empty((2, n, side, side), np.float32)
+        np.add((uv_px[self._order] / self._shrunk).T[..., None, None] + self._right, self._down, out=at)
+        patches = np.empty((n, side, side), np.float32)
+        for image, begin, end in self._runs:
+            u, v = at[:, begin:end].reshape(2, -1, side)
+            out = cv2.remap(image, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+            patches[self._order[begin:end]] = out.reshape(-1, side, side)
+        return patches
 
 
 def _runs(values: IntArray, longest: int) -> list[tuple[int, int]]:

@@ -20,11 +20,10 @@ from dualslam.frontends.direct.patches import MIN_CONTRAST
 from dualslam.frontends.direct.warp import (
     HALF,
     Pyramid,
+    Sampler,
     build_pyramid,
     correlate,
     inside,
-    sample,
-    sample_each,
     warp_points,
 )
 from dualslam.frontends.tracking.keyframe_images import KeyframeImages
@@ -156,7 +155,6 @@ class PatchAlignment:
 
     def _align_pairs(self, submap: Submap, pairs: _Pairs) -> _Aligned:
         camera, n = self._camera(), len(pairs.row)
-        templates = np.zeros((n, 2 * HALF + 3, 2 * HALF + 3), np.float32)
         uv, uv_there, scale, own_scale = np.zeros((n, 2)), np.zeros((n, 2)), np.zeros(n), np.zeros(n)
         T_submap_there, T_k_submap = np.zeros((n, 4, 4)), np.zeros((n, 4, 4))
         for other in np.unique(pairs.kf_there).tolist():
@@ -164,7 +162,6 @@ class PatchAlignment:
             T_submap_there[of], feature = submap.T_submap_kf[other], pairs.feature_there[of]
             uv_there[of] = self._as_read(submap, other, feature, camera)
             scale[of] = submap.keyframes[other].features.scale[feature]
-            templates[of] = self._templates(other, feature, uv_there[of], scale[of])
         keyframes, image_of = np.unique(pairs.kf, return_inverse=True)
         for k in keyframes.tolist():
             of = np.flatnonzero(pairs.kf == k)
@@ -176,19 +173,29 @@ class PatchAlignment:
         usable = inside(uv_there, steps, HALF + 1, camera.size_px) & np.isfinite(axes).all(axis=(1, 2))
         usable[usable] = inside(uv[usable], axes[usable], HALF, camera.size_px)
         images = [self._levels(k) for k in keyframes.tolist()]
+        templates = self._templates(pairs, uv_there, steps)
         return _align(templates, images, image_of, uv, axes, usable, REFINED_PX * own_scale)
 
-    def _templates(self, k: int, feature: IntArray, uv_px: FloatArray, scale: FloatArray) -> NDArray[np.float32]:
-        """Return patches about features of a keyframe, in their octaves; each is sampled once."""
-        kept = self._patches.get(k)
-        if kept is None or len(kept.is_known) <= feature.max():
-            kept = self._patches[k] = _Patches.of_size(int(feature.max()) + 1000)
-        new = np.flatnonzero(~kept.is_known[feature])
-        if len(new):
-            axes = scale[new, None, None] * np.eye(2)
-            kept.greys[feature[new]] = sample(self._levels(k), uv_px[new], axes, HALF + 1)
-            kept.is_known[feature[new]] = True
-        return kept.greys[feature]
+    def _templates(self, pairs: _Pairs, uv_px: FloatArray, steps: FloatArray) -> NDArray[np.float32]:
+        """Return patches about the older observations, in their octaves; each is sampled once."""
+        feature, keyframes = pairs.feature_there, np.unique(pairs.kf_there).tolist()
+        templates = np.empty((len(feature), 2 * HALF + 3, 2 * HALF + 3), np.float32)
+        rows = {k: np.flatnonzero(pairs.kf_there == k) for k in keyframes}
+        is_new = np.zeros(len(feature), np.bool_)
+        for k, of in rows.items():
+            kept = self._patches.get(k)
+            if kept is None or len(kept.is_known) <= feature[of].max():
+                kept = self._patches[k] = _Patches.of_size(int(feature[of].max()) + 1000)
+            is_new[of] = ~kept.is_known[feature[of]]
+        if is_new.any():  # one call for all
+            new, image_of = np.unique(pairs.kf_there[is_new], return_inverse=True)
+            images = [self._levels(k) for k in new.tolist()]
+            templates[is_new] = Sampler(images, image_of, steps[is_new], HALF + 1)(uv_px[is_new])
+        for k, of in rows.items():
+            kept, new_of = self._patches[k], of[is_new[of]]
+            kept.greys[feature[new_of]], kept.is_known[feature[new_of]] = templates[new_of], True
+            templates[of] = kept.greys[feature[of]]
+        return templates
 
     def _as_read(self, submap: Submap, k: int, feature: IntArray, camera: Camera) -> FloatArray:
         """Return where a keyframe's image shows features."""
@@ -250,16 +257,16 @@ def _align(
     agrees = np.zeros(n, np.bool_)
     if len(row):
         to_parameters = np.matmul(np.linalg.inv(H[row]), J[row].swapaxes(1, 2)).astype(np.float32)
+        axes = axes[row]
+        sampler = Sampler(images, image_of[row], axes, HALF)
         for _ in range(N_ITERATIONS):
-            found = sample_each(images, image_of[row], uv_px[row] + shift[row], axes[row], HALF).reshape(
-                len(row), -1, 1
-            )
+            found = sampler(uv_px[row] + shift[row]).reshape(len(row), -1, 1)
             du, dv, contrast = np.matmul(to_parameters, found)[:, :, 0].astype(np.float64).T
             d = np.stack([du, dv], axis=1) / np.maximum(contrast, 0.3)[:, None]
             step[row] = np.linalg.norm(d, axis=1)
             d /= np.maximum(step[row], 1.0)[:, None]
-            shift[row] -= np.einsum("nij,nj->ni", axes[row], d)
-        found = sample_each(images, image_of[row], uv_px[row] + shift[row], axes[row], HALF)
+            shift[row] -= np.einsum("nij,nj->ni", axes, d)
+        found = sampler(uv_px[row] + shift[row])
         agrees[row] = correlate(inner[row].reshape(found.shape), found) > AGREES
     agrees &= (step < CONVERGED) & (np.linalg.norm(shift, axis=1) < max_shift_px)
     return _Aligned(shift, tested, agrees)
