@@ -29,8 +29,8 @@ until another is significantly different."""
 AT_LOSS = 1.05
 """A map that may be at its end is asked once more, where it has so many times the keyframes of when it was asked: the
 next one begins with what it says. Lower, single frames without a pose would each cost a question."""
-MIN_AT_END = 10
-"""Keyframes of a map that is asked at the end of a run, since it was never old enough, or its question failed."""
+FEWEST_KEYFRAMES = 10
+"""Of a map that is asked before it is old enough: since the run ends, or since a lost map waits to be joined to it."""
 FAR_SIGMAS = 2.0
 """Standard deviations of the focal length's prior: a correction beyond them is to be confirmed by later keyframes."""
 SURE_SIGMA = 0.01
@@ -103,12 +103,16 @@ class Calibration:
         """Standard deviation of the logarithm of its focal length; None where it is as it was given."""
         return None if self._covariance is None else float(np.sqrt(self._covariance[0, 0]))
 
-    def is_due(self, submap: Submap) -> bool:
-        """Whether it is time to ask this submap."""
+    def is_due(self, submap: Submap, is_waited_for: bool = False) -> bool:
+        """Whether it is time to ask this submap.
+
+        `is_waited_for`: a lost map waits to be joined to it. A wrong camera bends the two in different ways, so that no
+        similarity fits both. Then it is asked as soon as it may answer.
+        """
         if self._refined_in not in (None, submap.id):
             return False  # what a longer submap said of the lens is not put at risk by a shorter one
-        due_at = self._due_at.get(submap.id, self._config.first_keyframes)
-        return self._config.refine and len(submap.keyframes) >= due_at
+        first = FEWEST_KEYFRAMES if is_waited_for else self._config.first_keyframes
+        return self._config.refine and len(submap.keyframes) >= self._due_at.get(submap.id, first)
 
     def is_due_at_loss(self, submap: Submap) -> bool:
         """Whether it is time to ask a submap that may be at its end: as long as none has estimated the camera."""
@@ -116,15 +120,19 @@ class Calibration:
         has_grown = n >= AT_LOSS * self._asked_with.get(submap.id, 0)
         return config.refine and self._refined_in is None and n >= config.first_keyframes and has_grown
 
-    def is_due_at_end(self, submap: Submap) -> bool:
-        """Whether to ask a submap as the run ends: it has not said anything, or is to confirm a large correction."""
+    def is_due_at_end(self, submap: Submap, is_waited_for: bool) -> bool:
+        """Whether to ask a submap as the run ends: it has not said anything, or is to confirm a large correction.
+
+        `is_waited_for`: a lost map waits to be joined to it. Then it is asked also if it has merely grown.
+        """
         n, off = len(submap.keyframes), abs(float(correction_of(self._camera).log_focal))
+        has_grown = n >= AT_LOSS * self._asked_with.get(submap.id, 0)
         if self._refined_in == submap.id:
-            is_far = off > FAR_SIGMAS * self._config.log_focal_sigma
-            is_open = is_far and n >= AT_LOSS * self._asked_with[submap.id]
+            is_open = has_grown and (is_waited_for or off > FAR_SIGMAS * self._config.log_focal_sigma)
         else:
-            is_open = self._refined_in is None and submap.id not in self._estimated
-        return self._config.refine and is_open and n >= MIN_AT_END
+            says_more = submap.id not in self._estimated or (is_waited_for and has_grown)
+            is_open = self._refined_in is None and says_more
+        return self._config.refine and is_open and n >= FEWEST_KEYFRAMES
 
     def estimate(self, submap: Submap) -> CalibrationEstimate | Failure:
         """Return what a submap says of the camera; nothing is changed."""
@@ -152,10 +160,16 @@ class Calibration:
         self._estimated.add(answer.submap.id)
 
     def _asked(self, submap_id: int, n: int) -> None:
-        self._due_at[submap_id], self._asked_with[submap_id] = int(np.ceil(GROWN * n)), n
+        self._asked_with[submap_id] = n
+        self._wait(submap_id, n, int(np.ceil(GROWN * n)))
 
     def _said_nothing(self, submap_id: int, n: int) -> None:
-        self._due_at[submap_id] = n + max(RETRY_KEYFRAMES, int(RETRY_SHARE * n))
+        self._wait(submap_id, n, n + max(RETRY_KEYFRAMES, int(RETRY_SHARE * n)))
+
+    def _wait(self, submap_id: int, n: int, due_at: int) -> None:
+        """Let a submap of `n` keyframes be asked again; a question before its time does not put off the one in time."""
+        first = self._config.first_keyframes
+        self._due_at[submap_id] = min(due_at, first) if n < first else due_at
 
     def refine(self, submap: Submap) -> dict[str, float] | Failure:
         """Ask a submap about its camera and, where the answer is clear, change the submap to it.

@@ -47,7 +47,7 @@ class Calibrations:
 
     def ask_if_due(self, live: VisualOdometry, now: FrameStamp) -> None:
         """Ask the live submap about its camera where it is time to."""
-        if self._calibration.is_due(live.submap):
+        if self._calibration.is_due(live.submap, self._is_waited_for(live)):
             self._ask(live, now)
 
     def ask_at_loss(self, live: VisualOdometry, now: FrameStamp) -> None:
@@ -58,17 +58,27 @@ class Calibrations:
     def finish(self, live: VisualOdometry, now: FrameStamp, ask: bool) -> None:
         """Take in what is open at the end of the run; `ask`: a live submap that has said nothing yet is asked.
 
-        A wrong camera bends a short map as it does a long one. The map stays as it is: one that a wrong camera has
-        broken is not mended by a better one.
+        A wrong camera bends a short map as it does a long one. Where a lost map waits to be joined to it, both take the
+        camera that is found. Otherwise the map stays as it is: one that a wrong camera has broken is not mended by a
+        better one.
         """
         self.collect(live, now, wait=True)
-        if not ask or not self._calibration.is_due_at_end(live.submap):
+        is_waited_for = self._is_waited_for(live)
+        if not ask or not self._calibration.is_due_at_end(live.submap, is_waited_for):
+            return
+        if is_waited_for:
+            self._ask(live, now)
+            self.collect(live, now, wait=True)
             return
         with self._record.timer.measure("calibration"):
             found = self._calibration.estimate(live.submap)
         if found.numbers:
             kept, reason = EventKind.CALIBRATION_KEPT, "asked at the end of the run"
             self._record.event(kept, now, live.submap.id, reason=reason, **found.numbers)
+
+    def _is_waited_for(self, live: VisualOdometry) -> bool:
+        """Whether a lost map is to be joined to the live one."""
+        return any(m != live.submap.id for m in self._recoveries.waiting)
 
     def _ask(self, live: VisualOdometry, now: FrameStamp) -> None:
         if self._desk.n_open(JobKind.CALIBRATION, live.submap.id):

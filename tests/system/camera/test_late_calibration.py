@@ -152,7 +152,7 @@ def test_a_map_is_asked_as_it_is_lost_and_the_next_begins_with_its_camera(polls:
     """It is not its time to be asked. An answer after twelve frames finds the map archived, and none yet live."""
     system, world = late_system(polls, recovery=True)
     calibration, blind = system._state.parts.calibration, range(40, 55)
-    calibration.is_due = lambda _: False  # type: ignore[method-assign]
+    calibration.is_due = lambda *_: False  # type: ignore[method-assign]
 
     def view_of(frame: Frame) -> View:
         view = world.view(frame, calibration)
@@ -176,6 +176,30 @@ def test_a_map_is_asked_as_it_is_lost_and_the_next_begins_with_its_camera(polls:
     assert not system.events.of_kind(EventKind.LINK_REFUSED)
     system.finish()
     assert len(trajectories_of(system).main.index) > N_FRAMES / 2
+
+
+@pytest.mark.slow
+def test_where_a_lost_map_waits_the_end_of_the_run_gives_both_the_camera_that_is_found() -> None:
+    system, world = late_system(0, recovery=True)
+    calibration, blind = system._state.parts.calibration, range(30, 45)
+    for name in ("is_due", "is_due_at_loss"):
+        setattr(calibration, name, lambda *_: False)
+
+    def view_of(frame: Frame) -> View:
+        view = world.view(frame, calibration)
+        return replace(view, features=view.features.take(np.arange(0))) if frame.index in blind else view
+
+    system._state.parts = replace(system._state.parts, view_of=view_of)
+    system._recoveries.settle = lambda live: None  # type: ignore[method-assign]
+    for i in range(N_FRAMES):
+        system.step(Frame(i, i / 30, None))
+    assert not system.events.of_kind(EventKind.CALIBRATED)
+    assert system._recoveries.waiting
+    system.finish()
+    assert len(system.events.of_kind(EventKind.CALIBRATED)) == 1
+    assert abs(np.log(calibration.camera.K[0, 0] / TRUE.fx)) < 0.25 * np.log(WRONG)
+    for submap in system.atlas.submaps.values():
+        np.testing.assert_array_equal(submap.K, calibration.camera.K)
 
 
 def test_what_has_come_since_follows() -> None:

@@ -115,10 +115,12 @@ class TestRefine:
         calibration = Calibration(
             wrong_camera(wrong), CalibrationConfig(), lambda *_: found, lambda submap: adjust_submap(submap, 1.345)
         )
-        assert calibration.is_due_at_end(submap)
+        assert calibration.is_due_at_end(submap, False)
         assert calibration.refine(submap)
-        assert not calibration.is_due_at_end(submap)
-        assert calibration.is_due_at_end(larger) is due
+        assert not calibration.is_due_at_end(submap, False)
+        assert calibration.is_due_at_end(larger, False) is due
+        assert calibration.is_due_at_end(larger, True)
+        assert not calibration.is_due_at_end(submap, True)
 
     def test_an_answer_is_asked_for_with_what_was_known_of_the_one_before(self) -> None:
         asked_with: list[FloatArray | None] = []
@@ -173,6 +175,18 @@ class TestRefine:
         assert calibration.is_due(submap)
         calibration.refine(submap)
         assert not calibration.is_due(submap)
+
+    def test_a_map_to_which_a_lost_one_is_to_be_joined_is_asked_sooner(self) -> None:
+        younger, young, grown = (make_submap(wrong_camera(WRONG), turning=True, n=n) for n in (9, 10, 15))
+        calibration = calibration_that_finds(estimate_of(RIGHT_AGAIN, accepted=False))
+        assert not calibration.is_due(young)
+        assert not calibration.is_due(younger, is_waited_for=True)
+        assert calibration.is_due(young, is_waited_for=True)
+        assert not calibration.is_due_at_end(younger, is_waited_for=True)
+        assert not calibration.refine(young)
+        assert not calibration.is_due(young, is_waited_for=True)
+        assert calibration.is_due(grown, is_waited_for=True)
+        assert calibration.is_due_at_end(grown, is_waited_for=True)
 
     def test_at_a_loss_it_is_due_once_more_until_a_map_has_told(self) -> None:
         camera = wrong_camera(WRONG)
