@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from dualslam.core.estimates import FrontendChoice
 from dualslam.core.threads import LIMITS
 from dualslam.lab.synthetic import SyntheticSequence, render_to_folder
 from dualslam.run.sources import make_world
@@ -43,6 +44,8 @@ def fake(world: SyntheticSequence, monkeypatch: pytest.MonkeyPatch) -> Callable[
     def install(**options: object) -> None:
         truth = dict(enumerate(world.ground_truth_T_world_cam))
         monkeypatch.setattr("dualslam.run.session.build_system", builder(truth, **options))
+        # No front end looks at the frames, so none need be chosen by them.
+        monkeypatch.setattr("dualslam.run.front_end.find_frontend", lambda *_: FrontendChoice("orb", "a fake"))
 
     install()
     return install

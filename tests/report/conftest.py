@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from dualslam.core.config.settings import Config
+from dualslam.core.config.settings import Config, FrontendConfig
 from dualslam.core.events import EventKind
 from dualslam.core.types import Frame
 from dualslam.lab.synthetic import SyntheticSequence, make_sequence
@@ -93,7 +93,7 @@ def make_run(world: SyntheticSequence, tmp_path_factory: pytest.TempPathFactory)
         poses = dict(enumerate(world.ground_truth_T_world_cam))
         sequence = WorldSequence(world)
         run_to_folder(
-            Config(seed=3),
+            Config(seed=3, frontend=FrontendConfig(name="orb")),
             sequence if truth else NoTruth(sequence),
             out,
             build=lambda config, camera: Eventful(poses, lost, before_step),  # type: ignore[arg-type, return-value]
