@@ -33,7 +33,11 @@ _ROW_MASK = (1 << _ROW_BITS) - 1
 
 
 def detect_corners(
-    image: NDArray[np.uint8], thresholds: Sequence[int], margin_px: int, cell_px: int
+    image: NDArray[np.uint8],
+    thresholds: Sequence[int],
+    margin_px: int,
+    cell_px: int,
+    known: tuple[IntArray, FloatArray] | None = None,
 ) -> tuple[IntArray, FloatArray]:
     """FAST corners of one pyramid level: the first threshold everywhere, lower ones only in cells still empty.
 
@@ -41,15 +45,21 @@ def detect_corners(
     - `thresholds`: grey-level contrasts, descending.
     - `margin_px`: width of the rim without corners, >= 3.
     - `cell_px`: side of the square cells in which emptiness is judged.
+    - `known`: what was found with higher thresholds: all of `thresholds` are tried in empty cells alone.
 
-    Returns pixels (N, 2) as (column, row), and FAST scores (N,): the largest threshold at which each is a corner.
+    Returns
+    -------
+    xy : (N, 2) int64
+        Pixel (column, row).
+    response : (N,) float64
+        FAST score: the largest threshold at which the corner would still be one.
     """
     height, width = image.shape
     if min(height, width) <= 2 * margin_px:
         return np.empty((0, 2), np.int64), np.empty(0)
     window = (margin_px, margin_px, width - margin_px, height - margin_px)
-    xy, response = _fast(image, thresholds[0], [window])
-    for threshold in thresholds[1:]:
+    xy, response = _fast(image, thresholds[0], [window]) if known is None else known
+    for threshold in thresholds[known is None :]:
         windows = _empty_runs(_occupied_cells(xy, window, cell_px), window, cell_px)
         found = _fast(image, threshold, windows)
         xy, response = np.concatenate([xy, found[0]]), np.concatenate([response, found[1]])

@@ -6,6 +6,7 @@ The defaults of noise and distances were measured on pairs of KITTI and 7-Scenes
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import repeat
 from math import ceil
 from typing import Annotated
@@ -164,19 +165,23 @@ class OrbFrontend(OptionedFrontend):
 
     def _corners(self, levels: list[NDArray[np.uint8]], noise: FloatArray) -> list[Corners]:
         """Candidate corners and their scores, level by level."""
-        corners = self._detected(levels, noise, self.options.fast_thresholds)
+        corners = self._detected(levels, noise, self.options.fast_thresholds, [None] * len(levels))
         if sum(len(xy) for xy, _ in corners) >= self.n_features:
             return corners
-        return self._detected(levels, noise, (*self.options.fast_thresholds, self.options.fast_threshold_last))
+        return self._detected(levels, noise, (self.options.fast_threshold_last,), corners)
 
     def _detected(
-        self, levels: list[NDArray[np.uint8]], noise: FloatArray, thresholds: tuple[int, ...]
+        self,
+        levels: list[NDArray[np.uint8]],
+        noise: FloatArray,
+        thresholds: tuple[int, ...],
+        known: Sequence[Corners | None],
     ) -> list[Corners]:
         corners = []
-        for level, sigma in zip(levels, noise.tolist(), strict=True):
+        for level, sigma, of_level in zip(levels, noise.tolist(), known, strict=True):
             lowest = min(ceil(NOISE_CONTRAST * sigma), MAX_THRESHOLD)
-            of_level = [max(threshold, lowest) for threshold in thresholds]
-            corners.append(detect_corners(level, of_level, MARGIN_PX, self.options.cell_px))
+            at_least = [max(threshold, lowest) for threshold in thresholds]
+            corners.append(detect_corners(level, at_least, MARGIN_PX, self.options.cell_px, of_level))
         return corners
 
     def _spread(
