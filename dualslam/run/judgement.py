@@ -109,7 +109,7 @@ def _coverage(system: System, rows: Sequence[FrameRow]) -> list[Reason]:
             "something in view that does not repeat, or give measurements (--measurements)."
         )
         return [Reason(ReasonCode.UNJOINED, Level.USABLE, text, first, last)]
-    first, last = _longest_run(sorted(row.index for row in unposed))
+    first, last = _longest_run(rows, sorted(row.index for row in unposed))
     text = (
         f"{len(unposed)} frames have no pose; the longest stretch is {first} to {last}. "
         "Move slower there, with more light and texture in view."
@@ -117,9 +117,10 @@ def _coverage(system: System, rows: Sequence[FrameRow]) -> list[Reason]:
     return [Reason(ReasonCode.UNPOSED, Level.USABLE, text, first, last)]
 
 
-def _longest_run(indices: list[int]) -> tuple[int, int]:
-    """Return first and last of the longest run of neighbours among ascending indices."""
-    parts = np.split(np.array(indices), np.flatnonzero(np.diff(indices) > 1) + 1)
+def _longest_run(rows: Sequence[FrameRow], indices: list[int]) -> tuple[int, int]:
+    """Return first and last of the longest run of neighbouring frames among some with ascending indices."""
+    places = np.searchsorted(sorted(row.index for row in rows), indices)
+    parts = np.split(np.array(indices), np.flatnonzero(np.diff(places) > 1) + 1)
     longest = max(parts, key=len)
     return int(longest[0]), int(longest[-1])
 
@@ -185,7 +186,7 @@ def _scale(rows: Sequence[FrameRow]) -> list[Reason]:
     unsure = sorted(index for index, sigma in known.items() if sigma > UNSURE_SCALE)
     if len(unsure) <= MAX_UNSURE * len(known):
         return []
-    first, last = _longest_run(unsure)
+    first, last = _longest_run(rows, unsure)
     text = (
         f"The size of the path at {len(unsure)} frames, mostly {first} to {last}, is hardly tied to that of the rest: "
         "it may be 20 % too large or too small. "

@@ -171,6 +171,16 @@ def test_where_the_scale_of_more_than_a_tenth_of_the_frames_is_unsure_a_run_is_u
     assert about == [(ReasonCode.SCALE, 80, 103)] * (level == "usable")
 
 
+def test_frames_of_a_strided_run_are_neighbours() -> None:
+    system = run(ahead())
+    rows = [
+        replace(row, index=2 * row.index, sigma_scale=0.2 if 80 <= row.index < 120 and row.index != 90 else 0.02)
+        for row in frame_rows(system)  # type: ignore[arg-type]
+    ]
+    (reason,) = judge_run(system, trajectories_of(system), rows).reasons  # type: ignore[arg-type]
+    assert (reason.code, reason.first_frame, reason.last_frame) == (ReasonCode.SCALE, 182, 238)
+
+
 @pytest.mark.parametrize(("is_sure", "level"), [(True, Level.GOOD), (False, Level.USABLE)])
 def test_a_join_of_unsure_scale_makes_the_smaller_part_doubtful(is_sure: bool, level: Level) -> None:
     system = run(ahead(), lost=(60,))
