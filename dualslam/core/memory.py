@@ -6,7 +6,7 @@ import ctypes
 import resource
 import sys
 
-M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3
+M_TRIM_THRESHOLD, M_MMAP_THRESHOLD, M_ARENA_MAX = -1, -3, -8
 """As in glibc's `malloc.h`."""
 KEPT_BYTES = 256 * 2**20
 """So much at most lies idle; SIFT's scale space of a KITTI image takes 110 MB."""
@@ -28,7 +28,9 @@ def keep_freed_memory() -> bool:
         mallopt = ctypes.CDLL(None).mallopt
     except (AttributeError, TypeError):
         return False
-    return bool(mallopt(M_MMAP_THRESHOLD, LARGEST_BYTES) and mallopt(M_TRIM_THRESHOLD, KEPT_BYTES))
+    # One arena: what the thread that reads images frees is used by the others, too.
+    settings = ((M_MMAP_THRESHOLD, LARGEST_BYTES), (M_TRIM_THRESHOLD, KEPT_BYTES), (M_ARENA_MAX, 1))
+    return all(mallopt(*setting) for setting in settings)
 
 
 def peak_rss_mb(with_children: bool = False) -> float:
