@@ -7,8 +7,11 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 
+import numpy as np
+
 from dualslam.atlas.tidying import tidy
 from dualslam.backend.final_refinement import refine_submap
+from dualslam.backend.registration_bundle import adjust_and_prune
 from dualslam.build.checks import check_config, check_given
 from dualslam.build.parts import atlas_solver, graph_maker, new_calibration, new_initialiser, place_parts, window_solver
 from dualslam.build.walks import recovery_parts
@@ -39,6 +42,7 @@ from dualslam.frontends.still_pixels import StillPixels
 from dualslam.frontends.tracking.initialiser import Initialiser
 from dualslam.frontends.tracking.keyframe_images import KeyframeImages
 from dualslam.frontends.tracking.pixel_search import PixelSearch
+from dualslam.frontends.tracking.registrar import Registrar
 from dualslam.frontends.tracking.rolling_shutter import RollingShutter
 from dualslam.frontends.tracking.visual import VisualFrontEnd
 from dualslam.io.map_store import StoredMap
@@ -47,6 +51,8 @@ from dualslam.map.graph_beside import BesideGraphs
 from dualslam.map.lens import Calibration
 from dualslam.map.solving import open_graph
 from dualslam.map.submap import Submap
+from dualslam.places.resemblance import find_resembling
+from dualslam.recovery.registration import MIN_PARALLAX_DEG
 from dualslam.system.state import Components
 from dualslam.system.system import System
 from dualslam.workers.desk import WorkerDesk
@@ -153,6 +159,11 @@ def build_system(
             walk_watch=watch,
             desk=desk,
             open_graph=open_one,
+            new_registrar=lambda submap: Registrar(frontend, config, submap, camera),
+            adjust=partial(
+                adjust_and_prune, robust_k=config.graph.robust_k, min_parallax_rad=np.radians(MIN_PARALLAX_DEG)
+            ),
+            alike=partial(find_resembling, distance=frontend.distance, max_distance=frontend.max_distance_strict),
             atlas_solver=atlas_solver(config),
             refine_at_end=partial(refine_submap, robust_k=config.graph.robust_k),
             patches=PatchAudit(live.camera),

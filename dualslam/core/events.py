@@ -40,6 +40,8 @@ class EventKind(StrEnum):
     FUSED = "fused"
     ABSORBED = "absorbed"
     CUT = "cut"
+    REGISTERED = "registered"
+    REGISTRATION_REFUSED = "registration_refused"
     LOOP_CLOSED = "loop_closed"
     LOOP_REFUSED = "loop_refused"
     MERGED = "merged"

@@ -166,6 +166,30 @@ of the submap's gauge stay where they are. `GraphEstimate.outlier_rows` are of t
 """
 
 
+class Registrar(Protocol):
+    """Poses frames in a finished submap, in any order, and extends it by them."""
+
+    def densify(self) -> None:
+        """Triangulate what the submap's keyframes share, whether tracking needed it or not."""
+        ...
+
+    def pose(self, view: View, keyframe_ids: Collection[int]) -> Track | Failure:
+        """Pose a frame by the landmarks of some keyframes, all together."""
+        ...
+
+    def refuse_repeated(self, track: Track, keyframe_ids: Collection[int]) -> Failure | None:
+        """Refuse a pose if another one explains nearly as much: then the scene repeats itself."""
+        ...
+
+    def insert(self, track: Track) -> None:
+        """Make a frame a keyframe of the submap that sees the landmarks by which it was posed."""
+        ...
+
+    def extend(self, keyframe_id: int, others: Collection[int]) -> None:
+        """Look for more landmarks of some keyframes in another, and triangulate new ones with them."""
+        ...
+
+
 class SubmapGraph(Protocol):
     """The factor graph of one submap. The submap's arrays are the record, the graph follows them.
 

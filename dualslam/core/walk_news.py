@@ -19,11 +19,13 @@ EVERY_S = 0.15
 """Between two news: a little less than between two looks of the live view, of which there are five a second."""
 MAX_POINTS = 128
 """Of a way: to the eye it is the same as one of all frames, and it stays below 2 kB in a pipe."""
+REGISTRATION = "registration"
+"""`WalkNews.attempt` of frames that are registered at the end of a run, in any order."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WalkNews:
-    """How far reverse tracking has come."""
+    """How far reverse tracking, or registration at the end of a run, has come."""
 
     submap_id: int  # from which it walks, and in whose frame its poses are
     attempt: str

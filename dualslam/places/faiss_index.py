@@ -20,6 +20,8 @@ from dualslam.core.types import Features, FloatArray, IntArray
 from dualslam.map.submap import Submap
 from dualslam.places.recogniser import PlaceCandidate
 
+DescriptorDistance = Callable[[NDArray[np.generic], NDArray[np.generic]], FloatArray]
+"""Between paired descriptors: `Frontend.distance`."""
 CELLS = Path(__file__).with_name("cells.npy")
 
 
@@ -53,9 +55,7 @@ class FaissRecogniser:
     - `max_distance`: between two views of one point (`Frontend.max_distance_strict`).
     """
 
-    def __init__(
-        self, distance: Callable[[NDArray[np.generic], NDArray[np.generic]], FloatArray], max_distance: float
-    ) -> None:
+    def __init__(self, distance: DescriptorDistance, max_distance: float) -> None:
         self._distance = distance
         self._max_distance = max_distance
         self._limit = max_distance  # in the unit of the index
@@ -150,7 +150,7 @@ class FaissRecogniser:
 
     def _make(self, descriptors: NDArray[Any]) -> Any:
         n = descriptors.shape[1]
-        if (step := self._step(descriptors[:1])) is not None:
+        if (step := step_of(self._distance, descriptors[:1])) is not None:
             self._limit = (self._max_distance / step) ** 2
             return faiss.IndexFlatL2(n)
         cells = shipped_cells()
@@ -161,16 +161,6 @@ class FaissRecogniser:
         index = faiss.IndexBinaryIVF(self._quantizer, 8 * n, len(cells))
         index.nprobe = N_PROBED
         return index
-
-    def _step(self, like: NDArray[Any]) -> float | None:
-        """Return the distance that one step of one number makes; None where descriptors are strings of bits."""
-        zero, one = np.zeros_like(like), np.zeros_like(like)
-        one[0, 0] = 1
-        step = float(self._distance(zero, one)[0])
-        if like.dtype != np.uint8:
-            return step
-        one[0, 0] = 255  # eight bits, or 255 steps
-        return None if float(self._distance(zero, one)[0]) == 8 * step else step
 
     def _as_asked(self, descriptors: NDArray[Any]) -> NDArray[Any]:
         return descriptors if isinstance(self._index, faiss.IndexBinary) else descriptors.astype(np.float32)
@@ -188,6 +178,17 @@ class FaissRecogniser:
             )
             self._table = self._submap_of[0], self._landmark_of[0]
         return self._table
+
+
+def step_of(distance: DescriptorDistance, like: NDArray[Any]) -> float | None:
+    """Return the distance that one step of one number makes; None where descriptors are strings of bits."""
+    zero, one = np.zeros_like(like), np.zeros_like(like)
+    one[0, 0] = 1
+    step = float(distance(zero, one)[0])
+    if like.dtype != np.uint8:
+        return step
+    one[0, 0] = 255  # eight bits, or 255 steps
+    return None if float(distance(zero, one)[0]) == 8 * step else step
 
 
 def _votes(submap: Submap, feature: IntArray, landmark: IntArray, n_features: int) -> tuple[IntArray, IntArray]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
 
 from dualslam.atlas.record import Record
@@ -12,13 +12,14 @@ from dualslam.core.interfaces import (
     FinalRefiner,
     MapStarter,
     PatchCheck,
+    Registrar,
     Scene,
     Seeker,
     Shutter,
     SubmapGraph,
     VisualOdometry,
 )
-from dualslam.core.types import Failure, FloatArray, Frame, LateFrame, View
+from dualslam.core.types import Failure, Features, FloatArray, Frame, LateFrame, View
 from dualslam.core.walk_news import WalkWatch
 from dualslam.io.map_store import StoredMap
 from dualslam.map.graph_beside import BesideGraphs
@@ -71,8 +72,8 @@ class Components:
     solved there. `refine_at_end`: has the last word on each submap.
     `patches`: compares frames with the images of older keyframes. `open_graph`: makes a graph of a submap in this
     process, solved. `open_features`: starts one more process, and returns a function that has the features of a frame
-    found there. `foresee`: precomputes in the background the features that reverse tracking may need. None without
-    background processes.
+    found there. `new_registrar`, `adjust`, `alike`: for `recovery/registration.py`. `foresee`: precomputes in the
+    background the features that reverse tracking may need. None without background processes.
     """
 
     view_of: Callable[[Frame], View | Failure]
@@ -91,6 +92,9 @@ class Components:
     places: PlaceParts
     desk: ScheduledDesk
     open_graph: Callable[[Submap], SubmapGraph]
+    new_registrar: Callable[[Submap], Registrar]
+    adjust: Callable[[Submap, Collection[int]], None]
+    alike: Callable[[Mapping[int, Features], Collection[int], int], dict[int, list[int]]]
     graphs: BesideGraphs | None = None
     open_features: Callable[[], Callable[[Frame], Frame]] | None = None
     foresee: Callable[[View], None] | None = None

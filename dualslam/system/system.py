@@ -38,6 +38,7 @@ from dualslam.system.masking import Masking
 from dualslam.system.motion_watch import Break
 from dualslam.system.places import PlaceKeeping
 from dualslam.system.pose_covariance import PoseCovariance
+from dualslam.system.registering import Registering
 from dualslam.system.starting import Starting
 from dualslam.system.state import Components, State
 from dualslam.system.tracking import Tracking
@@ -129,6 +130,7 @@ class System:
         self._tracking = Tracking(self._state, self._places)
         self._starting = Starting(self._state, self._tracking, self._recoveries, sightings)
         self._masking = Masking(self._state, self._starting)
+        self._registering = Registering(self._state, self._connections)
         self._endings = Endings(self._state, self._recoveries, self._connections, sightings, earlier)
 
     @property
@@ -262,6 +264,7 @@ class System:
             outcome = self._without_map(view) if state.live is None else self._with_map(state.live, view)
             if len(view.features) < state.config.tracking.min_inliers:
                 self.blank.add(frame.index)
+            self._registering.note(view)
         return self._result(frame, outcome, started)
 
     def keep(self, frame: Frame) -> None:
@@ -319,6 +322,8 @@ class System:
             self._endings.archive(state.live, "end of sequence")
         if last is not None and not interrupted and not state.localises:
             self._places.join_rest(self.atlas.submaps.keys() - self._earlier, last)
+            if state.config.recovery.enabled and self.saved is None and not self.pace.in_real_time:
+                self._registering.finish(last)
         shapes = {} if interrupted or state.localises else self._endings.refine()
         if last is not None:
             self._connections.settle(last)

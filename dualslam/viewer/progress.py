@@ -7,13 +7,13 @@ import time
 from typing import TYPE_CHECKING, TextIO
 
 from dualslam.core.types import Frame
-from dualslam.core.walk_news import WalkNews
+from dualslam.core.walk_news import REGISTRATION, WalkNews
 from dualslam.map.frame_records import FrameResult
 
 if TYPE_CHECKING:
     from dualslam.system.system import System
 
-FINISHING = "all frames are in: ending reverse tracking, writing the results"
+FINISHING = "all frames are in: ending reverse tracking, registering frames, writing the results"
 """Said once no frame is left to count: the last reverse tracking may take seconds."""
 IN_PLACE_S, LINE_S = 0.5, 15.0
 """Between two lines where the next takes the place of the one before, and where it stands below it."""
@@ -81,9 +81,8 @@ class RunState:
             said.append(f"{last.status}{where}")
         if self._walk is not None:
             walk = self._walk
-            said.append(
-                f"tracking in reverse from submap {walk.submap_id}: at frame {walk.frame}, {walk.n_posed} posed"
-            )
+            what = "registering in" if walk.attempt == REGISTRATION else "tracking in reverse from"
+            said.append(f"{what} submap {walk.submap_id}: at frame {walk.frame}, {walk.n_posed} posed")
         return "; ".join(said)
 
 

@@ -1,0 +1,185 @@
+"""Registration at the end of a run: frames outside the main map are looked for in it, whatever their order."""
+
+from __future__ import annotations
+
+import logging
+from collections import Counter
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from dualslam.atlas.connections import Connections
+from dualslam.atlas.record import FrameStamp
+from dualslam.atlas.trajectory import FramePose, Path
+from dualslam.core.errors import SolverError
+from dualslam.core.events import EventKind
+from dualslam.core.noise_model import PROOF_VIEWS
+from dualslam.core.types import FailureReason, FrameMethod, FrameStatus, View
+from dualslam.linking.join_test import judge_motion
+from dualslam.linking.motion import seam_motions
+from dualslam.map.frame_observations import FrameObservations
+from dualslam.map.submap import Submap
+from dualslam.recovery.frame_buffer import MB
+from dualslam.recovery.registration import REACH, Registration
+from dualslam.system.state import State
+
+log = logging.getLogger(__name__)
+
+REPEATS = (FailureReason.LOOK_ALIKE, FailureReason.LEAP, FailureReason.AMBIGUOUS_MODEL)
+"""Refusals that a scene which repeats itself causes."""
+
+
+class Registering:
+    """Keeps the features of frames without a pose, and registers them in the main map when the run is over."""
+
+    def __init__(self, state: State, connections: Connections) -> None:
+        self._state, self._connections = state, connections
+        self._kept: dict[int, View] = {}
+        self._nbytes = 0
+
+    def note(self, view: View) -> None:
+        """Keep a frame that has no pose, without its image; as many of them as the frame buffer may hold."""
+        state = self._state
+        if view.index in state.record.poses or len(view.features) < state.config.health.min_inliers:
+            return
+        if self._nbytes + view.features.nbytes <= state.config.buffer.max_mb * MB:
+            self._kept[view.index] = replace(view, image=None)
+            self._nbytes += view.features.nbytes
+
+    def finish(self, now: FrameStamp) -> None:
+        """Register frames in the submaps of the main map, the one with most frames first."""
+        atlas, record = self._state.record.atlas, self._state.record
+        if not record.poses or self._has_repeated():
+            return
+        count = Counter(pose.submap_id for pose in record.own_poses())
+        main = atlas.largest(count)
+        with record.timer.measure("registration"):
+            views = self._outside(main)
+            if not views:
+                return
+            whole = len(views) > sum(count[m] for m in main)
+            largest, *rest = sorted(main, key=lambda m: (-count[m], m))
+            if whole:
+                views |= self._views_of(rest)
+            alike = self._alike(views, main)
+            for m in [largest] if whole else [largest, *rest]:
+                self._register(atlas.submaps[m], views, alike, now)
+                views = {i: view for i, view in views.items() if i not in atlas.submaps[m].keyframes}
+
+    # --- steps
+
+    def _has_repeated(self) -> bool:
+        """Whether a pose or a join was refused in this run because the scene repeats itself, or by the camera's motion.
+
+        Single frames tell copies of a thing apart no better than whole maps do.
+        """
+        refused = self._state.record.events.of_kind(EventKind.FAILED, EventKind.LINK_REFUSED, EventKind.LOOP_REFUSED)
+        return any(event.data.get("reason") in REPEATS for event in refused)
+
+    def _outside(self, main: list[int]) -> dict[int, View]:
+        """Return the frames outside the main map: those without a pose, and the keyframes of other submaps."""
+        record, parts = self._state.record, self._state.parts
+        posed = {pose.index for pose in record.own_poses() if pose.submap_id in main}
+        camera = parts.calibration.camera
+        kept = [parts.scene.masked(self._kept[i]) for i in sorted(self._kept.keys() - record.poses.keys())]
+        kept = [parts.calibration.rectified(view) for view in kept]
+        if parts.shutter.readout_s:
+            kept = parts.shutter.all_corrected(kept, camera)
+        others = self._views_of(m for m in record.atlas.submaps if m not in main)
+        views = {view.index: view for view in kept} | others
+        return {i: views[i] for i in sorted(views) if i not in posed}
+
+    def _views_of(self, submap_ids: Iterable[int]) -> dict[int, View]:
+        """Return the keyframes of some submaps that their frames stand on."""
+        record, found = self._state.record, dict[int, View]()
+        for m in submap_ids:
+            submap = record.atlas.submaps[m]
+            for k in submap.keyframes.keys() & record.poses.keys() & record.rows.keys():
+                if record.poses[k].submap_id == m:
+                    keyframe = submap.keyframes[k]
+                    found[k] = View(k, keyframe.timestamp_s, keyframe.features)
+        return found
+
+    def _alike(self, views: dict[int, View], main: list[int]) -> dict[int, list[int]]:
+        """Return which frames, of these and of the main map's keyframes, each of these resembles."""
+        submaps = [self._state.record.atlas.submaps[m] for m in main]
+        images = {k: keyframe.features for submap in submaps for k, keyframe in submap.keyframes.items()}
+        images |= {i: view.features for i, view in views.items()}
+        return self._state.parts.alike(images, views.keys(), REACH + 1)
+
+    def _register(self, submap: Submap, views: dict[int, View], alike: dict[int, list[int]], now: FrameStamp) -> None:
+        """Register frames in one submap, and enter their poses; nothing, where the camera cannot have moved so."""
+        record, parts = self._state.record, self._state.parts
+        grown = submap.copy()
+        registrar, health = parts.new_registrar(grown), self._state.config.health
+        registration = Registration(grown, views, alike, registrar, parts.adjust, health, parts.walk_watch)
+        try:
+            added = registration.run()
+        except SolverError as error:
+            log.warning("no frame is registered in submap %d: %s", submap.id, error)
+            return
+        if not added:
+            return
+        added += [i for i in views if self._shows_enough(grown, i) and i not in added]
+        before = submap.copy()
+        old, new = self._paths(submap, grown, added)
+        refused = judge_motion(seam_motions(old, new)).refusal()
+        data = {"frames": len(added), "asked": len(views)}
+        if refused is not None:
+            record.event(EventKind.REGISTRATION_REFUSED, now, submap.id, detail=refused.detail, **data)
+            return
+        submap.take_over(grown)
+        self._connections.carry(before, submap)
+        self._enter(submap, added)
+        record.event(EventKind.REGISTERED, now, submap.id, **data)
+
+    def _shows_enough(self, submap: Submap, i: int) -> bool:
+        """Whether a frame is a keyframe that reverse tracking left in a submap, and is posed there as well."""
+        if i not in submap.keyframes or i in submap.condemned:
+            return False
+        n_proven = np.count_nonzero(submap.n_observations(submap.seen_in(i)) >= PROOF_VIEWS)
+        return bool(n_proven >= self._state.config.health.min_inliers)
+
+    def _paths(self, before: Submap, grown: Submap, added: list[int]) -> tuple[Path, Path]:
+        """Return the camera's path in a submap as it was, and that of the frames registered since."""
+        old = Path.of((p for p in self._state.record.own_poses() if p.submap_id == before.id), before)
+        poses = [FramePose(k, grown.keyframes[k].timestamp_s, grown.id, k, np.eye(4)) for k in added]
+        taken = set(added)
+        return old.take(np.array([i not in taken for i in old.index.tolist()], bool)), Path.of(poses, grown)
+
+    def _enter(self, submap: Submap, added: list[int]) -> None:
+        """Enter the poses of registered frames, and of the frames that hang on them in another submap."""
+        record = self._state.record
+        hanging = list(self._hanging_on(submap, added))
+        for k in added:
+            keyframe, is_new = submap.keyframes[k], k not in record.poses
+            seen = FrameObservations.of(keyframe.features, submap.landmark_of[k], submap.id)
+            n, pose = len(seen.landmark_ids), FramePose(k, keyframe.timestamp_s, submap.id, k, np.eye(4))
+            record.pose(pose, n, n, seen, FrameMethod.WIDE)
+            if is_new:
+                record.rows[k].status = FrameStatus.RECOVERED
+        for pose in hanging:
+            record.pose(pose)
+
+    def _hanging_on(self, submap: Submap, added: list[int]) -> Iterator[FramePose]:
+        """Yield new poses of frames that hang on registered keyframes of another submap, in the unit of the new one."""
+        record = self._state.record
+        taken = {k: record.poses[k].submap_id for k in added if k in record.poses}
+        for i, pose in record.poses.items():
+            m = pose.submap_id
+            if i not in record.rows or m not in taken.values():
+                continue
+            other = record.atlas.submaps[m]
+            anchor = other.anchored(pose.keyframe_id, other.resolve_anchor(pose.keyframe_id, pose.T_kf_cam))
+            k, own = anchor.keyframe_id, [a for a in taken if taken[a] == m and a != anchor.keyframe_id]
+            if i != k and taken.get(k) == m and own:
+                T_kf_cam = anchor.T_kf_cam.copy()
+                T_kf_cam[:3, 3] *= _scale_between(submap, other, k, min(own, key=lambda a: (abs(a - i), a)))
+                yield replace(pose, submap_id=submap.id, keyframe_id=k, T_kf_cam=T_kf_cam)
+
+
+def _scale_between(submap: Submap, other: Submap, a: int, b: int) -> float:
+    """Return by how much two keyframes are farther apart in one submap than in another."""
+    here, there = (float(np.linalg.norm(s.T_submap_kf[a][:3, 3] - s.T_submap_kf[b][:3, 3])) for s in (submap, other))
+    return here / max(there, 1e-12)
