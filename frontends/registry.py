@@ -8,7 +8,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from importlib.metadata import entry_points
 from importlib.util import find_spec
-from typing import Any, ClassVar, Self, TypeVar
+from typing import Any, ClassVar, Protocol, Self, TypeVar
 
 from pydantic import BaseModel, ValidationError
 
@@ -75,6 +75,22 @@ MATCHERS = Kind("pixel matcher", PIXEL_MATCHERS_GROUP, PIXEL_MATCHERS, "pixels")
 OptionsT = TypeVar("OptionsT", bound=BaseModel)
 
 
+class FrontendFactory(Protocol):
+    """Target of a registered name: usually a front end's class."""
+
+    def from_options(self, n_features: int, options: Mapping[str, Any]) -> Frontend:
+        """Build the front end; raise ConfigError where an option is unknown or out of range."""
+        ...
+
+
+class PixelMatcherFactory(Protocol):
+    """Target of a pixel matcher's name: usually its class."""
+
+    def from_options(self, options: Mapping[str, Any]) -> PixelMatcher:
+        """Build it; raise ConfigError where an option is unknown or out of range."""
+        ...
+
+
 def create_pixel_matcher(config: PixelsConfig) -> PixelMatcher | None:
     """Build the pixel matcher that the config names, by the same rules as a front end; None where it names none.
 
@@ -83,7 +99,8 @@ def create_pixel_matcher(config: PixelsConfig) -> PixelMatcher | None:
     """
     if config.name is None:
         return None
-    matcher: PixelMatcher = _factory(config.name, MATCHERS).from_options(config.options)
+    factory: PixelMatcherFactory = _factory(config.name, MATCHERS)
+    matcher = factory.from_options(config.options)
     if not callable(getattr(matcher, "find", None)):
         raise ConfigError(f"'{config.name}' is no pixel matcher: it has no find", (MATCHERS.section, "name"))
     return matcher
@@ -97,7 +114,8 @@ def create_frontend(config: FrontendConfig, needs: Iterable[str] = FOR_MAPS) -> 
     Raises `ConfigError`: the name is unknown, its target cannot be imported, an option is wrong, or the result lacks
     one of `needs`.
     """
-    frontend: Frontend = _factory(config.name).from_options(config.n_features, config.options)
+    factory: FrontendFactory = _factory(config.name)
+    frontend = factory.from_options(config.n_features, config.options)
     lacking = [name for name in needs if not hasattr(frontend, name)]
     if lacking:
         raise ConfigError(f"'{config.name}' is no front end: it has no {', '.join(lacking)}", NAME)
@@ -162,7 +180,7 @@ def parse_options(model: type[OptionsT], owner: str, options: Mapping[str, Any],
 
 
 def _factory(name: str, kind: Kind = FRONTENDS) -> Any:
-    """Import what a name points to, usually a class; `from_options` raises `ConfigError` where an option is wrong."""
+    """Import what a name points to."""
     field = (kind.section, "name")
     try:
         found = _import(name, kind)
