@@ -158,6 +158,23 @@ def test_a_clock_that_is_right_is_left_alone():
     assert solution.clock_offset_s.get("simulated GPS", 0.0) == 0.0
 
 
+def test_a_map_that_drifts_less_than_it_claims_is_kept_stiff_between_positions_at_its_ends():
+    truth = drive()
+    problem = drifted(truth, drift=0.1)
+    source = Receiver(seed=1).positions(truth)
+    ends = [row for row in source.rows if not 10.0 < row.values[0] < truth.timestamps_s[-1] - 10.0]
+    solution = solve(problem, replace(source, rows=ends))
+    assert solution.drift < 1.0
+    aligned = umeyama(
+        np.array([problem.T_world_cam[round(RATE_HZ * row.values[0]), :3, 3] for row in ends]),
+        np.array([row.values[1:4] for row in ends]),
+    ).S_dst_src
+    stiff = np.linalg.norm(
+        sim3.act(aligned, problem.T_world_cam[:, :3, 3]) - truth.T_world_cam[:, :3, 3], axis=1
+    )  # as good as these positions allow
+    assert rmse(errors_m(problem, solution, truth)) < 1.5 * rmse(stiff)
+
+
 def test_a_map_that_drifts_more_than_it_claims_is_bent_further():
     truth = drive()
     problem = drifted(truth, drift=5.0)
@@ -248,7 +265,7 @@ def test_what_is_wrong_with_some_readings_does_not_bend_the_map(name):
     assert umeyama(T[:, :3, 3], truth.T_world_cam[:, :3, 3]).rmse < 0.8
     if name != "axes turned":
         assert rmse(errors_m(problem, solution, truth)) < 1.2
-    assert solution.drift == 1.0
+    assert solution.drift <= 1.0
 
 
 @pytest.mark.parametrize("words", cases(REFUSED))
