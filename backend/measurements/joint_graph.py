@@ -186,8 +186,8 @@ class JointGraph:
     def _improbability(self, graph: gtsam.NonlinearFactorGraph) -> float:
         """Return minus twice the logarithm of the probability of the readings at this drift, up to a constant.
 
-        It is Laplace's approximation. Readings that say nothing of the drift have the same at any. Infinite if so little
-        holds the gauge that the normal equations have no digits left.
+        It is Laplace's approximation. Readings that say nothing of the drift have the same at any. Infinite if so
+        little holds the gauge that the normal equations have no digits left.
         """
         try:
             information = 2.0 * float(graph.linearize(self.values).eliminateMultifrontal().logDeterminant())

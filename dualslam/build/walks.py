@@ -56,7 +56,7 @@ def recovery_parts(
         for view in sorted(job.own, key=lambda view: view.index, reverse=True):  # those next to the walk stay
             refinder.remember(view)
         window = window_solver(config)
-        return VisualFrontEnd(frontend, config, submap, graph, camera, refinder, not job.lost, window)
+        return VisualFrontEnd(frontend, config, submap, graph, camera, refinder, not job.lost, window, prior=job.prior)
 
     auxiliaries = _auxiliaries(config, n_threads)
 

@@ -14,7 +14,7 @@ from typing import Any, Protocol
 
 from dualslam import __version__
 from dualslam.build import build_system
-from dualslam.build.parts import atlas_solver, metric_parts
+from dualslam.build.parts import atlas_solver, metric_parts, motion_prior
 from dualslam.core.camera.base import Camera
 from dualslam.core.camera.focal import FocalSearch
 from dualslam.core.config.files import dump_config
@@ -170,7 +170,8 @@ def run_to_folder(
     decisions : bool
         Write ``decisions.jsonl``: every decision with its numbers and thresholds.
     measurements : iterable of MeasurementSource
-        From outside the images: they put the map into their frame at the end.
+        From outside the images: they put the map into their frame at the end. A gyroscope or an odometry also predicts
+        the camera's turns, across gaps above all.
 
     Raises
     ------
@@ -197,6 +198,8 @@ def run_to_folder(
         given["frontend_choice"] = asdict(chosen)
         log.info("front end %s: %s", chosen.name, chosen.why)
     recorded = None if replay is None else Recorded.read(Path(replay) / SCHEDULE)
+    measurements = tuple(measurements)
+    prior = motion_prior(measurements) if measurements else None
     colours: Colours = {}
     if saved_map is not None:
         comes_once = isinstance(sequence, WebcamSequence)
@@ -206,11 +209,11 @@ def run_to_folder(
             camera = camera_that_fits(config, sequence, camera, saved_map)
         saved = load_atlas(saved_map)
         colours = saved.colours
-        system = build_system(config, camera, saved=saved, localise=localise, schedule=recorded)
-    elif recorded is not None:
-        system = build_system(config, sequence.camera, schedule=recorded)
+        system = build_system(config, camera, saved=saved, localise=localise, schedule=recorded, prior=prior)
+    elif recorded is not None or build is None:
+        system = build_system(config, sequence.camera, schedule=recorded, prior=prior)
     else:
-        system = (build or build_system)(config, sequence.camera)
+        system = build(config, sequence.camera)
     with closing(system.desk), RunFolder(out, overwrite=overwrite) as folder:
         folder.write_config(dump_config(config))
         origin = _origin(config, given)
