@@ -80,7 +80,7 @@ def _strip(run: RunData, sigmas: list[float | None], name: str, note: str, thres
     first = 0
     for i, part in enumerate(parts):
         if (worst := _worst(part)) is not None:
-            share = 1.0 if np.isinf(worst) else float((np.log10(worst) - low) / (high - low))
+            share = 1.0 if np.isinf(worst) else float((np.log10(max(worst, 10.0**low)) - low) / (high - low))
             frames = f"frames {run.rows[first].index} to {run.rows[first + len(part) - 1].index}"
             title = tag("title", f"{frames}: {'not known' if np.isinf(worst) else number(worst, 2)}")
             share = max(share, 0.01)

@@ -210,10 +210,10 @@ def run_to_folder(
         saved = load_atlas(saved_map)
         colours = saved.colours
         system = build_system(config, camera, saved=saved, localise=localise, schedule=recorded, prior=prior)
-    elif recorded is not None or build is None:
+    elif recorded is not None or (prior is not None and build is None):
         system = build_system(config, sequence.camera, schedule=recorded, prior=prior)
     else:
-        system = build(config, sequence.camera)
+        system = (build or build_system)(config, sequence.camera)
     with closing(system.desk), RunFolder(out, overwrite=overwrite) as folder:
         folder.write_config(dump_config(config))
         origin = _origin(config, given)
