@@ -8,6 +8,7 @@ from dualslam.core.camera.calibrated_size import find_calibrated_size
 from dualslam.core.camera.mapped import own_camera
 from dualslam.core.estimates import MAX_PRIOR_SIGMAS
 from dualslam.core.events import Event, EventKind
+from dualslam.map.lens import SURE_SIGMA
 from dualslam.system.audit.verdict import Level, ReasonCode
 from dualslam.system.system import System
 
@@ -38,11 +39,14 @@ def judge_camera(system: System) -> tuple[ReasonCode, Level, str] | None:
         return ReasonCode.CAMERA, Level.DOUBTFUL, text
     if (found := _by_answers(_answers(system))) is not None:
         return ReasonCode.CAMERA, *found
+    # In a bend 1 % of focal length costs 10 % of scale and more: what links join across one is no surer than that.
+    is_linked = bool(system.events.of_kind(EventKind.LINKED))
     sigma = system.log_focal_sigma
-    if sigma is None or sigma < MAX_FOCAL_SIGMA:
+    if sigma is None or sigma < (SURE_SIGMA if is_linked else MAX_FOCAL_SIGMA):
         return None
+    effect = "Maps that were joined may differ in scale by ten times as much. " if is_linked else ""
     text = (
-        f"The focal length is known to {100 * sigma:.0f} % only. "
+        f"The focal length is known to {100 * sigma:.1f} % only. {effect}"
         "Give a calibration with --camera, or record more sideways motion."
     )
     return ReasonCode.FOCAL, Level.USABLE, text

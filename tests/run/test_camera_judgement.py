@@ -84,6 +84,21 @@ def test_a_focal_length_that_is_hardly_known_makes_a_run_usable() -> None:
     assert found[:2] == (ReasonCode.FOCAL, Level.USABLE)
 
 
+@pytest.mark.parametrize(
+    ("sigma", "is_linked", "is_good"), [(0.013, True, False), (0.013, False, True), (0.008, True, True)]
+)
+def test_maps_are_joined_for_sure_only_under_a_camera_that_is_known_well(
+    sigma: float, is_linked: bool, is_good: bool
+) -> None:
+    system = system_that_answered()
+    system.log_focal_sigma = sigma  # type: ignore[assignment]
+    if is_linked:
+        system.events.add(EventKind.LINKED, 70, 3.0, 1, old_submap=0)
+    found = judge_camera(system)  # type: ignore[arg-type]
+    assert (found is None) is is_good
+    assert found is None or found[:2] == (ReasonCode.FOCAL, Level.USABLE)
+
+
 def scaled(camera: Camera, factor: float) -> PinholeCamera:
     """Return the intrinsics of images of another size, said to be of this one."""
     of = camera.scaled(factor)
