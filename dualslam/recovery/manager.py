@@ -306,9 +306,8 @@ class Recoveries:
         known = self._path_in(found.old_id).moved(sim3.inverse(link.S_old_new))
         newest = int(link.agreeing_keyframes[-1])
         old, new = known.take(known.index <= newest), path.take(path.index > newest)
-        if (
-            refused := self._refuse_turn(old, path.take(np.isin(path.index, [p.index for p in own])), link)
-        ) is not None:
+        tracked = path.take(np.isin(path.index, [pose.index for pose in own]))
+        if (refused := self._refuse_turn(old, tracked, link)) is not None:
             return refused
         # The test is made in the unit of the new map, in which the link moves the old one.
         S_new_old, Ad = sim3.inverse(link.S_old_new), sim3.adjoint(link.S_old_new)

@@ -64,8 +64,7 @@ class Registration:
         if not any(self._ask(i) for i in sorted(self.views)):
             return added
         self.registrar.densify()
-        self.adjust(self.submap, self.submap.keyframes)
-        due, n_adjusted = set(self.views), len(self.submap.keyframes)
+        due, n_adjusted = set(self.views), self._adjust_all()
         while len(self.submap.keyframes) < MAX_KEYFRAMES:
             for i in sorted(due):
                 self._ask(i)
@@ -74,8 +73,7 @@ class Registration:
             if best is None:
                 if len(self.submap.keyframes) == n_adjusted:
                     return added
-                self.adjust(self.submap, self.submap.keyframes)
-                n_adjusted, due = len(self.submap.keyframes), set(self.views)
+                due, n_adjusted = set(self.views), self._adjust_all()
                 continue
             # The map has grown, or was adjusted, since the frame was posed.
             if not self._ask(best) or self._is_repeated(best):
@@ -85,11 +83,15 @@ class Registration:
             self._report(best, len(added))
             due = self._beside(best)
             if len(self.submap.keyframes) >= GROWTH * n_adjusted:
-                self.adjust(self.submap, self.submap.keyframes)
-                n_adjusted = len(self.submap.keyframes)
+                n_adjusted = self._adjust_all()
         return added
 
     # --- steps
+
+    def _adjust_all(self) -> int:
+        """Adjust all keyframes; return how many there are."""
+        self.adjust(self.submap, self.submap.keyframes)
+        return len(self.submap.keyframes)
 
     def _report(self, i: int, n_added: int) -> None:
         T = self.submap.T_submap_kf[i].astype(np.float32)

@@ -135,6 +135,11 @@ class System:
         self._endings = Endings(self._state, self._recoveries, self._connections, sightings, earlier)
 
     @property
+    def _registers(self) -> bool:
+        """Whether frames outside the main map are registered at the end of the run."""
+        return self._state.config.recovery.enabled and self.saved is None and not self.pace.in_real_time
+
+    @property
     def desk(self) -> ScheduledDesk:
         """Where background work is done."""
         return self._state.parts.desk
@@ -265,7 +270,8 @@ class System:
             outcome = self._without_map(view) if state.live is None else self._with_map(state.live, view)
             if len(view.features) < state.config.tracking.min_inliers:
                 self.blank.add(frame.index)
-            self._registering.note(view)
+            if self._registers:
+                self._registering.note(view)
         return self._result(frame, outcome, started)
 
     def keep(self, frame: Frame) -> None:
@@ -323,7 +329,7 @@ class System:
             self._endings.archive(state.live, "end of sequence")
         if last is not None and not interrupted and not state.localises:
             self._places.join_rest(self.atlas.submaps.keys() - self._earlier, last)
-            if state.config.recovery.enabled and self.saved is None and not self.pace.in_real_time:
+            if self._registers:
                 self._registering.finish(last)
         shapes = {} if interrupted or state.localises else self._endings.refine()
         if last is not None:
