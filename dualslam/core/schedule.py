@@ -141,7 +141,6 @@ class Recorded:
     last_frame: int | None = None  # at which the run ended; None: it was cut off, and its last lines are missing
     interrupted: bool = False
     departure: str = ""  # where the repetition has come apart from the record, and why; empty while it has not
-    departed_at: When = None
 
     waits = True
 
@@ -220,7 +219,7 @@ class Recorded:
     def depart(self, frame: When, why: str) -> None:
         """Note where the repetition comes apart from the record; from there on answers come as by default."""
         if not self.departure:
-            self.departed_at, self.departure = frame, f"frame {frame}: {why}"
+            self.departure = f"frame {frame}: {why}"
 
     @property
     def _stated(self) -> After:

@@ -37,6 +37,8 @@ N_PROBED = 8
 """Cells that are searched for a descriptor: between the 4 and 16 that were measured (recall 0.91 and 0.97)."""
 N_NEAREST = 3
 """Landmarks that one feature may vote for: a point is often in the map more than once (lost and found again)."""
+N_CANDIDATES = 3
+"""Keyframes that are returned for one image."""
 SAME_PLACE = 0.3
 """Share of landmarks in common from which two keyframes show one place: the worse of them is no other candidate."""
 
@@ -106,7 +108,6 @@ class FaissRecogniser:
         features: Features,
         submaps: Mapping[int, Submap],
         may_be: Callable[[int, int], bool] = lambda submap_id, keyframe_id: True,
-        at_most: int = 3,
     ) -> list[PlaceCandidate]:
         """Return the keyframes that an image resembles most, best first, each of another place.
 
@@ -132,7 +133,7 @@ class FaissRecogniser:
         voted.sort(key=lambda c: (-c.n_votes, c.submap_id, c.keyframe_id))
         chosen: list[PlaceCandidate] = []
         for candidate in voted:
-            if len(chosen) == at_most:
+            if len(chosen) == N_CANDIDATES:
                 break
             m, k = candidate.submap_id, candidate.keyframe_id
             if k in submaps[m].condemned or not may_be(m, k):

@@ -67,8 +67,8 @@ def camera_that_fits(config: Config, frames: Iterable[Frame], camera: Camera, sa
     known = load_camera(saved_map)
     if known is None:
         return camera
-    config = config.with_section("recovery", workers=0)
-    as_given = log_focal_of(_frames_in_map(config, frames, camera, load_atlas(saved_map)))
+    config, saved = config.with_section("recovery", workers=0), load_atlas(saved_map)
+    as_given = log_focal_of(_frames_in_map(config, frames, camera, saved))
     if as_given is not None and _agrees(*as_given):
         return camera
 
@@ -77,7 +77,7 @@ def camera_that_fits(config: Config, frames: Iterable[Frame], camera: Camera, sa
             tried = MappedCamera.of(zoomed(camera_for_map(known, camera), log_zoom), known.K)
         except InputError:  # the lens was calibrated for a narrower view
             return camera, []
-        return tried, _frames_in_map(config, frames, tried, load_atlas(saved_map))
+        return tried, _frames_in_map(config, frames, tried, saved)
 
     zooms = [log_zoom for log_zoom in LOG_ZOOMS if as_given is not None or abs(log_zoom) >= FAR_ZOOM]
     tries = {log_zoom: seen_with(log_zoom) for log_zoom in zooms}

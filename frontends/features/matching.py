@@ -13,6 +13,11 @@ from dualslam.core.interfaces import Frontend
 from dualslam.core.types import BoolArray, Features, FloatArray, IntArray, Matches
 from dualslam.frontends.features.groups import NO_MATCHES, best_pairs, best_per_group, consistent_rotation
 
+EPIPOLE_PX = 10.0
+"""Features nearer to the epipole of their image are passed over: no parallax there."""
+EPIPOLAR_RATIO = 0.85
+"""Greatest best distance over second best on an epipolar line, in the best one's octave."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FeatureGrid:
@@ -26,23 +31,16 @@ class FeatureGrid:
     start: IntArray  # (rows * columns + 1,): where each cell begins in `order`
 
     @classmethod
-    def build(
-        cls, uv_px: FloatArray, cell_px: float = 16.0, bounds: tuple[float, float, float, float] | None = None
-    ) -> FeatureGrid:
+    def build(cls, uv_px: FloatArray, cell_px: float = 16.0) -> FeatureGrid:
         """Sort features into cells.
 
         - `uv_px` (N, 2): usually `features.uv_rect_px`. Non-finite positions are never found.
         - `cell_px`: about the usual search radius.
-        - `bounds` (left, top, right, bottom): what the cells cover, pixels; the features' bounding box by default.
-          Features outside are found all the same: they are kept in the cells of the rim.
         """
         finite = np.isfinite(uv_px).all(axis=1)
-        if bounds is None:
-            box = uv_px[finite] if finite.any() else np.zeros((1, 2))
-            low, high = box.min(axis=0), box.max(axis=0)
-        else:
-            low, high = np.array(bounds[:2], np.float64), np.array(bounds[2:], np.float64)
-        columns, rows = (int(extent // cell_px) + 1 for extent in np.maximum(high - low, 0.0))
+        box = uv_px[finite] if finite.any() else np.zeros((1, 2))
+        low, high = box.min(axis=0), box.max(axis=0)
+        columns, rows = (int(extent // cell_px) + 1 for extent in high - low)
         cell = _cells(uv_px[finite], low, cell_px, (rows, columns))
         flat = cell[:, 1] * columns + cell[:, 0]
         start = np.zeros(rows * columns + 1, np.int64)
@@ -133,22 +131,17 @@ def match_epipolar(
     rows_b: IntArray,
     F_b_a: FloatArray,
     *,
-    epipole_px: float = 10.0,
     octave_tolerance: int = 1,
-    ratio: float = 0.85,
-    check_rotation: bool = True,
 ) -> Matches:
     """Match features of two keyframes of known relative pose, along epipolar lines, one to one.
 
     A pair is a candidate if the feature of b lies on the epipolar line of that of a, and the octaves are close. The
-    tolerance is the 95 % gate of both features' noise. Of the candidates, pairs that are best for each other are kept.
+    tolerance is the 95 % gate of both features' noise. Of the candidates, pairs are kept that are best for each other,
+    clearly so, and share the common change of orientation.
 
     - `rows_a` (A,), `rows_b` (B,): features that take part, usually those without a landmark.
     - `F_b_a` (3, 3): fundamental matrix on rectified pixels: the line in b of x_a is ``F_b_a @ x_a``, its sign and
       scale are free.
-    - `epipole_px`: features nearer than this to the epipole of their image are passed over: no parallax there.
-    - `ratio`: greatest best distance over second best on the line, in the best one's octave. 1: no test.
-    - `check_rotation`: drop pairs that do not share the common change of orientation.
 
     Returns Matches: rows of `a` (ascending in the order of `rows_a`), rows of `b`.
     """
@@ -156,20 +149,18 @@ def match_epipolar(
     first, second = _near_lines(
         uv_a, uv_b, a.sigma_px[rows_a], b.sigma_px[rows_b], a.octave[rows_a], b.octave[rows_b], F_b_a, octave_tolerance
     )
-    usable = _off_epipole(uv_a, F_b_a, epipole_px)[first] & _off_epipole(uv_b, F_b_a.T, epipole_px)[second]
+    usable = _off_epipole(uv_a, F_b_a)[first] & _off_epipole(uv_b, F_b_a.T)[second]
     first, second = first[usable], second[usable]
     if len(first) == 0:
         return NO_MATCHES
     distance = frontend.distance(a.descriptors.take(rows_a[first], axis=0), b.descriptors.take(rows_b[second], axis=0))
     octave_b = b.octave[rows_b[second]]
-    chosen = best_pairs(first, second, distance, octave_b, ratio, len(rows_a), len(rows_b))
+    chosen = best_pairs(first, second, distance, octave_b, EPIPOLAR_RATIO, len(rows_a), len(rows_b))
     # Best for b among all candidates, not only among those that are some feature's best.
     chosen = np.intersect1d(chosen, best_per_group(second, distance, len(rows_b)), assume_unique=True)
     chosen = chosen[distance[chosen] <= frontend.max_distance]
     index = np.stack([rows_a[first[chosen]], rows_b[second[chosen]]], axis=1)
-    kept = np.ones(len(index), np.bool_)
-    if check_rotation:
-        kept = consistent_rotation(b.angle_rad[index[:, 1]] - a.angle_rad[index[:, 0]])
+    kept = consistent_rotation(b.angle_rad[index[:, 1]] - a.angle_rad[index[:, 0]])
     return Matches(index[kept], distance[chosen][kept])
 
 
@@ -232,10 +223,10 @@ def _near_lines(
     return rows_a, rows_b
 
 
-def _off_epipole(uv_px: FloatArray, F_other: FloatArray, radius_px: float) -> BoolArray:
+def _off_epipole(uv_px: FloatArray, F_other: FloatArray) -> BoolArray:
     """Which points of an image are not beside its epipole, the null vector of `F_other` (which maps its points)."""
     epipole = np.linalg.svd(F_other)[2][-1]
     if abs(epipole[2]) < 1e-9:
         return np.ones(len(uv_px), np.bool_)
-    off: BoolArray = np.hypot(*(uv_px - epipole[:2] / epipole[2]).T) > radius_px
+    off: BoolArray = np.hypot(*(uv_px - epipole[:2] / epipole[2]).T) > EPIPOLE_PX
     return off

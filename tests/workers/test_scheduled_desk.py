@@ -200,7 +200,6 @@ def test_a_repetition_that_asks_for_something_else_says_where_and_goes_on() -> N
         desk.submit(GRAPH, 1.0)
         if frame != 2:
             desk.submit(CALIBRATION, np.ones(1), of=0)
-    assert record.departed_at == 1
     assert "frame 1: it asks for calibration of submap 0 at 1; the record has graph at 2" in record.departure
     assert desk.drain(CALIBRATION)[0].result == 2
 

@@ -8,11 +8,11 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from dualslam.core.errors import ConfigError, OutputError
+from dualslam.core.errors import OutputError
 from dualslam.lab.synthetic.sequence import SyntheticSequence
 
 
-def render_to_folder(sequence: SyntheticSequence, out: str | Path, image_format: str = "png") -> Path:
+def render_to_folder(sequence: SyntheticSequence, out: str | Path) -> Path:
     """Render all frames of a sequence into a new folder.
 
     It holds ``images/NNNNNN.png``, named by frame index, without dropped frames. ``times.txt`` has seconds, one line a
@@ -24,8 +24,6 @@ def render_to_folder(sequence: SyntheticSequence, out: str | Path, image_format:
     sequence : SyntheticSequence
     out : path
         A folder that does not exist yet, or is empty.
-    image_format : {"png", "jpg"}
-        Lossless, or JPEG of quality 95.
 
     Returns
     -------
@@ -34,13 +32,9 @@ def render_to_folder(sequence: SyntheticSequence, out: str | Path, image_format:
 
     Raises
     ------
-    ConfigError
-        Where the image format is another.
     OutputError
         Where the folder is in use or cannot be written.
     """
-    if image_format not in ("png", "jpg"):
-        raise ConfigError(f"image format {image_format!r} is unknown; use png or jpg")
     out = Path(out)
     try:
         if out.exists() and (not out.is_dir() or any(out.iterdir())):
@@ -49,10 +43,9 @@ def render_to_folder(sequence: SyntheticSequence, out: str | Path, image_format:
         _write_texts(sequence, out)
     except OSError as error:
         raise OutputError(f"{out} cannot be written: {error.strerror or error}") from error
-    options = [cv2.IMWRITE_JPEG_QUALITY, 95] if image_format == "jpg" else [cv2.IMWRITE_PNG_COMPRESSION, 3]
     for frame in sequence:
-        path = out / "images" / f"{frame.index:06d}.{image_format}"
-        if frame.image is None or not cv2.imwrite(str(path), frame.image, options):
+        path = out / "images" / f"{frame.index:06d}.png"
+        if frame.image is None or not cv2.imwrite(str(path), frame.image, [cv2.IMWRITE_PNG_COMPRESSION, 3]):
             raise OutputError(f"{path} cannot be written; is the disk full?")
     return out
 

@@ -189,13 +189,13 @@ class Painter:
         joint = ((ys - row) < 0.14)[:, None] | ((xs - col) < 0.14 * brick_height / brick_width)
         self.image[joint] += np.float32(mortar)
 
-    def crack(self, level: float, length_m: float, width_m: float = 0.0) -> None:
+    def crack(self, level: float, length_m: float) -> None:
         """Draw a random walk from a random place."""
         n = 14
         heading = self.uniform(0, 2 * np.pi) + np.cumsum(self.rng.normal(0, 0.6, n))
         steps = np.stack([np.cos(heading), np.sin(heading)], 1) * length_m / n
         start = self.rng.uniform(0, 1, 2) * self.size_m
-        self.line(start + np.cumsum(steps, 0), level, width_m)
+        self.line(start + np.cumsum(steps, 0), level)
 
     def leaves(self, count: int, radius_m: tuple[float, float], levels: tuple[float, float], cut: bool = False) -> None:
         """Scatter leaf-like ellipses; with `cut`, they are what is opaque."""

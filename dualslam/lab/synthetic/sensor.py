@@ -11,6 +11,8 @@ from dualslam.lab.synthetic.events import Disturbance
 U8Image = NDArray[np.uint8]
 
 _GAMMA = 2.2
+VIGNETTING = 0.3
+"""Part of the light lost in the corners."""
 
 
 class Sensor:
@@ -27,8 +29,6 @@ class Sensor:
         Standard deviation, grey levels.
     stops : float
         Exposure, relative to textures as they are painted.
-    vignetting : float
-        Part of the light lost in the corners.
     """
 
     def __init__(
@@ -39,7 +39,6 @@ class Sensor:
         blur_px: float = 0.6,
         noise: float = 1.8,
         stops: float = 0.0,
-        vignetting: float = 0.3,
     ) -> None:
         self._seed = seed
         self._size = (width, height)
@@ -47,7 +46,7 @@ class Sensor:
         self._noise = noise
         self._stops = stops
         x, y = np.linspace(-1, 1, width)[None, :], np.linspace(-1, 1, height)[:, None]
-        self._lens = ((1 - vignetting * (x**2 + y**2) / 2) ** (1 / _GAMMA)).astype(np.float32)
+        self._lens = ((1 - VIGNETTING * (x**2 + y**2) / 2) ** (1 / _GAMMA)).astype(np.float32)
 
     def expose(self, scene: U8Image, index: int, what: Disturbance) -> U8Image:
         """Return the image (H, W) uint8 of frame `index`, given the rendered scene and its disturbances."""

@@ -17,6 +17,8 @@ from dualslam.core.types import FloatArray
 from dualslam.lab.synthetic.painter import NoiseBank, Painter
 
 SUN = np.array([0.6, 0.8])
+MAX_BYTES = 120_000_000
+"""Of the finest levels that are kept; the coarser ones add up to three times as much."""
 """(x, z) along which the light comes in."""
 Material = Callable[[Painter], None]
 U8Image = NDArray[np.uint8]
@@ -127,14 +129,12 @@ class TextureStore:
     scene : Scene
     detail : float
         Factor on every surface's `texels_per_m`: small images need less.
-    max_bytes : int
-        Finest levels kept; the coarser ones add up to three times as much.
     """
 
-    def __init__(self, scene: Scene, detail: float = 1.0, max_bytes: int = 120_000_000) -> None:
+    def __init__(self, scene: Scene, detail: float = 1.0) -> None:
         self._scene = scene
         self._detail = detail
-        self._max_bytes = max_bytes
+        self._max_bytes = MAX_BYTES
         self._bank = NoiseBank(scene.seed)
         self._textures: OrderedDict[int, Texture] = OrderedDict()
         self._bytes = 0

@@ -7,6 +7,7 @@ import pytest
 
 from dualslam.core.chi_square import CHI2_95
 from dualslam.core.types import Features, FloatArray, Matches
+from dualslam.frontends.features import matching
 from dualslam.frontends.features.matching import FeatureGrid, match_epipolar, match_projected
 from dualslam.frontends.features.orb import OrbFrontend
 from tests.frontends.conftest import made_up_features
@@ -37,18 +38,16 @@ def test_grid_finds_what_a_loop_finds() -> None:
     asked[3] = np.inf
     asked[4, 0] = np.nan
     radius = rng.uniform(0, 80, 60)
-    for bounds in (None, (0.0, 0.0, 640.0, 480.0), (100.0, 100.0, 101.0, 101.0)):
-        grid = FeatureGrid.build(uv, 16.0, bounds)
-        query, feature = grid.within(asked, radius)
-        expected = {
-            (m, i)
-            for m in range(60)
-            for i in range(400)
-            if np.isfinite(asked[m]).all() and np.hypot(*(uv[i] - asked[m])) <= radius[m]
-        }
-        assert set(zip(query.tolist(), feature.tolist(), strict=True)) == expected
-        assert len(query) == len(expected)
-        assert (np.diff(query) >= 0).all()
+    query, feature = FeatureGrid.build(uv, 16.0).within(asked, radius)
+    expected = {
+        (m, i)
+        for m in range(60)
+        for i in range(400)
+        if np.isfinite(asked[m]).all() and np.hypot(*(uv[i] - asked[m])) <= radius[m]
+    }
+    assert set(zip(query.tolist(), feature.tolist(), strict=True)) == expected
+    assert len(query) == len(expected)
+    assert (np.diff(query) >= 0).all()
 
 
 def test_grid_of_nothing() -> None:
@@ -100,7 +99,7 @@ def test_projected_matches_agree_with_a_loop(ratio: float) -> None:
     octave = features.octave[source] + rng.integers(-1, 2, 200)
     radius = rng.uniform(5, 30, 200)
     taken = rng.random(300) < 0.2
-    grid = FeatureGrid.build(features.uv_rect_px, 16.0, (0, 0, 200, 150))
+    grid = FeatureGrid.build(features.uv_rect_px, 16.0)
     matches = match_projected(
         FRONTEND, grid, features, uv, radius, descriptors, octave=octave, ratio=ratio, taken=taken
     )
@@ -175,19 +174,12 @@ def test_epipolar_matches_are_right_and_complete() -> None:
 
 
 @pytest.mark.parametrize("sign", [1.0, -3.0])
-def test_epipolar_matches_agree_with_a_loop(sign: float) -> None:
+def test_epipolar_matches_agree_with_a_loop(sign: float, monkeypatch: pytest.MonkeyPatch) -> None:
     a, b, F_b_a, _, _ = two_views(150, seed=6)
-    matches = match_epipolar(
-        FRONTEND,
-        a,
-        b,
-        np.arange(150),
-        np.arange(150),
-        sign * F_b_a,
-        ratio=1.0,
-        epipole_px=0.0,
-        check_rotation=False,
-    )
+    monkeypatch.setattr(matching, "EPIPOLAR_RATIO", 1.0)
+    monkeypatch.setattr(matching, "EPIPOLE_PX", 0.0)
+    monkeypatch.setattr(matching, "consistent_rotation", lambda turns: np.ones(len(turns), np.bool_))
+    matches = match_epipolar(FRONTEND, a, b, np.arange(150), np.arange(150), sign * F_b_a)
     cost = np.full((150, 150), np.inf)
     for i in range(150):
         line = F_b_a @ (*a.uv_px[i], 1.0)
@@ -204,7 +196,7 @@ def test_epipolar_matches_agree_with_a_loop(sign: float) -> None:
     assert {tuple(row) for row in matches.index.tolist()} == expected
 
 
-def test_features_beside_the_epipole_are_passed_over() -> None:
+def test_features_beside_the_epipole_are_passed_over(monkeypatch: pytest.MonkeyPatch) -> None:
     # Forward motion: the epipole is in the middle of both images.
     F_b_a = np.linalg.inv(K).T @ np.array([[0, -1.0, 0], [1, 0, 0], [0, 0, 0]]) @ np.linalg.inv(K)
     uv = np.array([[323.0, 240.0], [420.0, 300.0]])
@@ -214,7 +206,8 @@ def test_features_beside_the_epipole_are_passed_over() -> None:
     )
     rows = np.arange(2)
     assert match_epipolar(FRONTEND, same, same, rows, rows, F_b_a).index.tolist() == [[1, 1]]
-    assert len(match_epipolar(FRONTEND, same, same, rows, rows, F_b_a, epipole_px=1.0)) == 2
+    monkeypatch.setattr(matching, "EPIPOLE_PX", 1.0)
+    assert len(match_epipolar(FRONTEND, same, same, rows, rows, F_b_a)) == 2
 
 
 def test_epipolar_matching_of_nothing() -> None:

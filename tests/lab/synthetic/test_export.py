@@ -10,7 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from dualslam.core.config.corruption import Corruption, CorruptionKind
-from dualslam.core.errors import ConfigError, OutputError
+from dualslam.core.errors import OutputError
 from dualslam.lab.synthetic import make_sequence, render_to_folder
 
 
@@ -52,5 +52,3 @@ def test_what_cannot_be_written_is_refused(tmp_path: Path) -> None:
         render_to_folder(sequence, tmp_path / "used")
     with pytest.raises(OutputError, match="cannot be written"):
         render_to_folder(sequence, tmp_path / "used" / "file" / "below")
-    with pytest.raises(ConfigError, match="bmp"):
-        render_to_folder(sequence, tmp_path / "new", image_format="bmp")
