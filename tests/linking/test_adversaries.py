@@ -86,14 +86,8 @@ def test_no_wrong_link_is_made(case):
     offered, result = offer(*case)
     if isinstance(result, LinkEstimate):
         assert not is_wrong(offered, result.S_old_new), (link_error(offered, result.S_old_new), result.numbers)
-
-
-@pytest.mark.slow
-def test_a_link_of_unsure_scale_is_not_off_by_three_of_its_sigmas():
-    for case in CASES[::3]:
-        offered, result = offer(*case)
-        unsure = result.unsure if isinstance(result, LinkRefusal) else None
-        assert unsure is None or abs(link_error(offered, unsure.S_old_new)[0]) < 3.0 * unsure.sigma_scale
+    unsure = result.unsure if isinstance(result, LinkRefusal) else None
+    assert unsure is None or abs(link_error(offered, unsure.S_old_new)[0]) < 3.0 * unsure.sigma_scale
 
 
 @pytest.mark.parametrize("case", list(one_of_each(CASES[::7])))
