@@ -165,13 +165,10 @@ def _offset(path: CameraPath, source: MeasurementSource, up: FloatArray | None) 
     costs = [_offset_cost(path, common, float(offset), up) for offset in grid]
     best = int(np.argmin(costs))
     dof = len(inner) - 8 / 3  # a reading counts once; the similarity and the offset take eight of three numbers each
-    return float(grid[best]) if beats_chance(costs[best], costs[0], dof) else 0.0
-
-
-def beats_chance(cost: float, cost_without: float, dof: float) -> bool:
-    """Whether one more unknown explains more than chance does, by residuals with and without it (F-test at 99 %)."""
-    gained = ((cost_without / max(cost, 1e-12)) ** 2 - 1.0) * dof
-    return dof > 0 and gained > float(fdtri(1.0, dof, 0.99))
+    if dof <= 0:
+        return 0.0
+    ratio = (costs[0] / max(costs[best], 1e-12)) ** 2
+    return float(grid[best]) if (ratio - 1.0) * dof > fdtri(1.0, dof, 0.99) else 0.0
 
 
 def _offset_cost(path: CameraPath, source: MeasurementSource, offset_s: float, up: FloatArray | None) -> float:
@@ -205,29 +202,18 @@ def _with_mounts(path: CameraPath, source: MeasurementSource, offset_s: float) -
     measured, seen = _turns(path, source, offset_s) if turnable else (np.zeros((0, 3)),) * 2
     if len(measured) < 3:
         return source
-    R = mount_of(measured, seen, source.has_clock)
-    if R is None:
-        return source  # it turned about one axis only
-    if np.linalg.det(R) < 0:
-        raise InputError(f"{source.name}: the axes of its rotations are mirrored; they must be right-handed.")
-    mount = Mount(se3.from_parts(R, np.zeros(3)), False)
-    return replace(source, readings=[replace(r, mount=mount) if id(r) in turnable else r for r in source.readings])
-
-
-def mount_of(measured: FloatArray, seen: FloatArray, has_bias: bool = True) -> FloatArray | None:
-    """Return the rotation (3, 3) from a sensor's axes to the camera's, by turns that both saw (N, 3).
-
-    None where they turned about one axis only; a reflection where the sensor's axes are mirrored.
-    """
     bias = np.zeros(3)
     for _ in range(3):
         U, values, Vt = np.linalg.svd(seen.T @ (measured - bias))
-        R = np.asarray(U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt)
-        if has_bias and (measured != 0).any():
+        R = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+        if source.has_clock and (measured != 0).any():
             bias = np.median(measured - seen @ R, axis=0)
     if values[1] < LINE * values[0]:
-        return None
-    return np.asarray(U @ Vt) if np.linalg.det(U @ Vt) < 0 and values[2] > 0.1 * values[1] else R
+        return source  # it turned about one axis only
+    if np.linalg.det(U @ Vt) < 0 and values[2] > 0.1 * values[1]:
+        raise InputError(f"{source.name}: the axes of its rotations are mirrored; they must be right-handed.")
+    mount = Mount(se3.from_parts(R, np.zeros(3)), False)
+    return replace(source, readings=[replace(r, mount=mount) if id(r) in turnable else r for r in source.readings])
 
 
 # --- without positions

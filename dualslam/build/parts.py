@@ -19,7 +19,6 @@ from dualslam.core.config.settings import Config
 from dualslam.core.estimates import FrontendChoice
 from dualslam.core.interfaces import Frontend, SelfCalibrator, WindowSolver
 from dualslam.core.metric_problem import MeasurementSource, MetricProblem, MetricSolution, RowSource
-from dualslam.core.motion_prior import LivePrior
 from dualslam.core.types import Failure, FloatArray, Frame
 from dualslam.frontends.choice import Candidate, choose_frontend
 from dualslam.frontends.features.images import features_of
@@ -85,14 +84,6 @@ def measurement_sources(rows: Iterable[RowSource]) -> list[MeasurementSource]:
     from dualslam.backend.measurements.registry import readings_of
 
     return [readings_of(source) for source in rows]
-
-
-def motion_prior(sources: Iterable[MeasurementSource] = ()) -> LivePrior:
-    """Build what knows the camera's turns while a run goes on, by the first source that measures turns."""
-    from dualslam.backend.measurements.turns import TurnPrior
-
-    source = next((s for s in sources if any(hasattr(r, "turn_rad") for r in s.readings)), None)
-    return TurnPrior() if source is None else TurnPrior(source.readings, source.has_clock)
 
 
 def window_solver(config: Config) -> WindowSolver:

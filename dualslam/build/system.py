@@ -30,7 +30,6 @@ from dualslam.core.config.settings import Config
 from dualslam.core.errors import InputError
 from dualslam.core.interfaces import Frontend, SubmapGraph
 from dualslam.core.jobs import InlineDesk, JobKind
-from dualslam.core.motion_prior import LivePrior
 from dualslam.core.schedule import AT_ONCE, After, Policy, Recorded
 from dualslam.core.types import View
 from dualslam.core.walk_news import WalkWatch
@@ -71,7 +70,6 @@ def build_system(
     new_graph: Callable[[], SubmapGraph] | None = None,
     schedule: Policy | None = None,
     in_process: bool = False,
-    prior: LivePrior | None = None,
 ) -> System:
     """Build a system from its config.
 
@@ -92,8 +90,6 @@ def build_system(
         come.
     in_process : bool
         Whether the workers' jobs are done in this process; the schedule is the same. So they are for `Recorded`.
-    prior : LivePrior, optional
-        Knows the camera's turns by other sensors (`dualslam.build.parts.motion_prior`).
 
     Raises
     ------
@@ -120,7 +116,7 @@ def build_system(
 
     if saved is not None and not localise:
         saved = replace(saved, poses=tidy(saved.atlas, saved.poses))
-    live = LiveParts(config, frontend, calibration, camera, 0 if saved is None else saved.next_id, prior)
+    live = LiveParts(config, frontend, calibration, camera, 0 if saved is None else saved.next_id)
     scene = SceneMask(StillPixels(camera.size_px) if config.camera.find_still_pixels else None)
     reader = FrameReader(frontend, live.camera, config.camera.model_sigma_px, shutter, scene)
 
@@ -175,7 +171,6 @@ def build_system(
             places=places,
             open_features=opens,
             foresee=partial(_foresee, desk) if not in_process and config.recovery.enabled else None,
-            prior=prior,
         ),
         config,
         saved,
@@ -197,7 +192,6 @@ class LiveParts:
     given: Camera
     first_id: int = 0
     """Number of the first frame: those before it are of the runs that have left the saved map."""
-    prior: LivePrior | None = None
 
     def camera(self) -> Camera:
         """Return the camera as it is known now."""
@@ -218,9 +212,18 @@ class LiveParts:
     def _front_end(self, submap: Submap, graph: SubmapGraph, looks_everywhere: bool = False) -> VisualFrontEnd:
         config, frontend = self.config, self.frontend
         refinder = Refinder(submap, frontend, self.camera, config.camera.model_sigma_px)
-        window, pixels = window_solver(config), self._pixel_search(refinder.images)
-        parts = refinder, looks_everywhere, window, self.first_id, pixels, self.prior
-        return VisualFrontEnd(frontend, config, submap, graph, self.given, *parts)
+        return VisualFrontEnd(
+            frontend,
+            config,
+            submap,
+            graph,
+            self.given,
+            refinder=refinder,
+            looks_everywhere=looks_everywhere,
+            window=window_solver(config),
+            first_id=self.first_id,
+            pixels=self._pixel_search(refinder.images),
+        )
 
     def _pixel_search(self, images: KeyframeImages) -> PixelSearch | None:
         """Make what finds landmarks by their pixels, if a pixel matcher is chosen."""

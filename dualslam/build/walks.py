@@ -55,8 +55,10 @@ def recovery_parts(
         refinder = Refinder(submap, frontend, lambda: job.camera, config.camera.model_sigma_px)
         for view in sorted(job.own, key=lambda view: view.index, reverse=True):  # those next to the walk stay
             refinder.remember(view)
-        window = window_solver(config)
-        return VisualFrontEnd(frontend, config, submap, graph, camera, refinder, not job.lost, window, prior=job.prior)
+        window, everywhere = window_solver(config), not job.lost
+        return VisualFrontEnd(
+            frontend, config, submap, graph, camera, refinder=refinder, looks_everywhere=everywhere, window=window
+        )
 
     auxiliaries = _auxiliaries(config, n_threads)
 

@@ -14,7 +14,6 @@ from dualslam.core.config.settings import Config
 from dualslam.core.estimates import PreferredCamera
 from dualslam.core.events import Event
 from dualslam.core.interfaces import SubmapGraph, VisualOdometry
-from dualslam.core.motion_prior import MotionPrior
 from dualslam.core.types import Failure, FloatArray, FrameMethod, IntArray, LateFrame, View
 from dualslam.linking import DescriptorMatcher, LinkEstimate, estimate_link
 from dualslam.map.frame_observations import FrameObservations
@@ -50,7 +49,6 @@ class RecoveryJob:
     again, by the keyframes that both hold."""
     live_since: int = 0  # the keyframe that the submap's first walk set out from
     late: tuple[LateFrame, ...] = ()  # frames among the views that came too late to be tracked
-    prior: MotionPrior | None = None  # the camera's turns by other sensors
     is_again: bool = False  # whether reverse tracking from this submap is repeated: by the first attempt alone
 
 

@@ -20,9 +20,7 @@ from dualslam.core.events import EventKind
 from dualslam.core.geometry import sim3
 from dualslam.core.interfaces import SubmapGraph, VisualOdometry
 from dualslam.core.jobs import Desk, Ended, JobKind
-from dualslam.core.motion_prior import LivePrior
 from dualslam.core.types import Failure, FailureReason, LateFrame, View
-from dualslam.linking import LinkEstimate
 from dualslam.linking.join_test import judge_motion
 from dualslam.linking.motion import gaps_of, join_slack, seam_motions, step_motions
 from dualslam.map.lens import Calibration, rectified_where_possible
@@ -77,7 +75,6 @@ class Recoveries:
         connections: Connections,
         config: RecoveryConfig,
         front_ends: Callable[[], Iterable[VisualOdometry]],
-        prior: LivePrior | None = None,
     ) -> None:
         self._record = record
         self._buffer = buffer
@@ -87,7 +84,6 @@ class Recoveries:
         self._connections = connections
         self._config = config
         self._front_ends = front_ends
-        self._prior = prior
         self._lost: dict[int, Loss] = {}  # not linked yet, or too loosely, until the newer map is lost as well
         self._under_way: dict[int, _UnderWay] = {}  # by the new submap's id
         self._circumstances: dict[int, dict[str, Any]] = {}  # of the walk, by the new submap's id
@@ -206,7 +202,6 @@ class Recoveries:
             joined={m: sound_copy(submaps[m]) for m in joined},
             live_since=self._retries.start_of(submap, newest_id),
             late=late,
-            prior=None if self._prior is None else self._prior.known,
             is_again=now is not None,
         )
         n_live = self._retries.n_live(submap, newest_id if now is None else now.index)
@@ -301,14 +296,11 @@ class Recoveries:
         Across the gaps that reverse tracking has crossed, and where the new map follows on the old one.
         """
         link = found.estimate
-        own = [pose for pose in self._record.own_poses() if pose.submap_id == result.submap.id]
+        own = (pose for pose in self._record.own_poses() if pose.submap_id == result.submap.id)
         path = path_of(result.submap, result.frames, own)
         known = self._path_in(found.old_id).moved(sim3.inverse(link.S_old_new))
         newest = int(link.agreeing_keyframes[-1])
         old, new = known.take(known.index <= newest), path.take(path.index > newest)
-        tracked = path.take(np.isin(path.index, [pose.index for pose in own]))
-        if (refused := self._refuse_turn(old, tracked, link)) is not None:
-            return refused
         # The test is made in the unit of the new map, in which the link moves the old one.
         S_new_old, Ad = sim3.inverse(link.S_old_new), sim3.adjoint(link.S_old_new)
         moved = Ad @ link.covariance @ Ad.T
@@ -318,19 +310,6 @@ class Recoveries:
 
         gaps = step_motions(path, gaps_of(path.times_s), known)
         return judge_motion(chain(gaps, seam_motions(old, new, slack))).refusal()
-
-    def _refuse_turn(self, old: Path, live: Path, link: LinkEstimate) -> Failure | None:
-        """Return why a link contradicts the turn, as other sensors know it, from a lost map to the live one.
-
-        - `old`, `live`: in the same coordinates.
-        """
-        if self._prior is None or not len(old) or not len(live):
-            return None
-        last, first = (self._record.poses[int(i)] for i in (old.index[-1], live.index[0]))
-        turn = self._prior.turn(last.timestamp_s, first.timestamp_s)
-        if turn is None:
-            return None
-        return turn.refuse(old.T_map_cam[-1, :3, :3].T @ live.T_map_cam[0, :3, :3], link.covariance)
 
     def _note_events(self, result: RecoveryResult) -> None:
         """Take over the events of a walk's attempts; each attempt says what was known of the loss, too."""

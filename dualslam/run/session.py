@@ -14,7 +14,7 @@ from typing import Any, Protocol
 
 from dualslam import __version__
 from dualslam.build import build_system
-from dualslam.build.parts import atlas_solver, metric_parts, motion_prior
+from dualslam.build.parts import atlas_solver, metric_parts
 from dualslam.core.camera.base import Camera
 from dualslam.core.camera.focal import FocalSearch
 from dualslam.core.config.files import dump_config
@@ -135,7 +135,7 @@ def run_to_folder(
     overwrite: bool = False,
     realtime: bool = False,
     on_frame: Callable[[FrameResult], None] | None = None,
-    build: Callable[[Config, Camera], System] | None = None,
+    build: Callable[..., System] | None = None,
     saved_map: str | Path | None = None,
     localise: bool = False,
     focal: FocalSearch | None = None,
@@ -157,7 +157,8 @@ def run_to_folder(
     on_frame : callable, optional
         Called with each frame's result.
     build : callable, optional
-        Makes the system of a config and a camera; `build_system` if it is not given.
+        Makes the system, as `build_system` does, which is asked if it is not given. Of keywords it gets `schedule`, if
+        a run is repeated, and `saved` and `localise`, if a map is given.
     saved_map : path, optional
         Run folder whose map this run finds its frames in, and extends. It is read and never written.
     localise : bool
@@ -170,8 +171,7 @@ def run_to_folder(
     decisions : bool
         Write ``decisions.jsonl``: every decision with its numbers and thresholds.
     measurements : iterable of MeasurementSource
-        From outside the images: they put the map into their frame at the end. A gyroscope or an odometry also predicts
-        the camera's turns, across gaps above all.
+        From outside the images: they put the map into their frame at the end.
 
     Raises
     ------
@@ -198,9 +198,9 @@ def run_to_folder(
         given["frontend_choice"] = asdict(chosen)
         log.info("front end %s: %s", chosen.name, chosen.why)
     recorded = None if replay is None else Recorded.read(Path(replay) / SCHEDULE)
-    measurements = tuple(measurements)
-    prior = motion_prior(measurements) if measurements else None
+    parts: dict[str, Any] = {} if recorded is None else {"schedule": recorded}
     colours: Colours = {}
+    camera = sequence.camera
     if saved_map is not None:
         comes_once = isinstance(sequence, WebcamSequence)
         sequence = in_size_of_map(sequence, saved_map)
@@ -209,11 +209,8 @@ def run_to_folder(
             camera = camera_that_fits(config, sequence, camera, saved_map)
         saved = load_atlas(saved_map)
         colours = saved.colours
-        system = build_system(config, camera, saved=saved, localise=localise, schedule=recorded, prior=prior)
-    elif recorded is not None or (prior is not None and build is None):
-        system = build_system(config, sequence.camera, schedule=recorded, prior=prior)
-    else:
-        system = (build or build_system)(config, sequence.camera)
+        parts |= {"saved": saved, "localise": localise}
+    system = (build or build_system)(config, camera, **parts)
     with closing(system.desk), RunFolder(out, overwrite=overwrite) as folder:
         folder.write_config(dump_config(config))
         origin = _origin(config, given)

@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dualslam.build import build_system
-from dualslam.build.parts import motion_prior
 from dualslam.core.camera.base import Camera
 from dualslam.core.config.files import load_config
 from dualslam.core.config.settings import Config
@@ -84,11 +83,8 @@ class Slam:
         self._camera = camera if isinstance(camera, Camera) else Camera.read(camera)
         of_map = saved_map if isinstance(saved_map, str | Path) else None
         self._config, _ = with_frontend_chosen(load_config() if config is None else config, None, of_map)
-        self._prior = motion_prior()
         saved = load_atlas(saved_map) if isinstance(saved_map, str | Path) else saved_map
-        self.system: System = build_system(
-            self._config, self._camera, saved=saved, localise=localise, prior=self._prior
-        )
+        self.system: System = build_system(self._config, self._camera, saved=saved, localise=localise)
         self._began, self._cpu_began = time.perf_counter(), time.process_time()
         self._hidden = read_mask(Path(mask), self._camera.size_px) if isinstance(mask, str | Path) else mask
         if self._hidden is not None and (
@@ -133,12 +129,8 @@ class Slam:
         return result
 
     def add(self, *readings: Any) -> None:
-        """Take measurements from outside the images, such as `Position`; `save` puts the map into their frame.
-
-        Those of turns also guide tracking and recovery, if they come before the frames that they are about.
-        """
+        """Take measurements from outside the images, such as `Position`; `save` puts the map into their frame."""
         self._readings += readings
-        self._prior.add(readings)
 
     @property
     def map(self) -> ExportedMap | None:

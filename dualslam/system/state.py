@@ -19,7 +19,6 @@ from dualslam.core.interfaces import (
     SubmapGraph,
     VisualOdometry,
 )
-from dualslam.core.motion_prior import LivePrior
 from dualslam.core.types import Failure, Features, FloatArray, Frame, LateFrame, View
 from dualslam.core.walk_news import WalkWatch
 from dualslam.io.map_store import StoredMap
@@ -75,7 +74,6 @@ class Components:
     process, solved. `open_features`: starts one more process, and returns a function that has the features of a frame
     found there. `new_registrar`, `adjust`, `alike`: for `recovery/registration.py`. `foresee`: precomputes in the
     background the features that reverse tracking may need. None without background processes.
-    `prior`: knows the camera's turns by other sensors.
     """
 
     view_of: Callable[[Frame], View | Failure]
@@ -100,7 +98,6 @@ class Components:
     graphs: BesideGraphs | None = None
     open_features: Callable[[], Callable[[Frame], Frame]] | None = None
     foresee: Callable[[View], None] | None = None
-    prior: LivePrior | None = None
 
     @property
     def K(self) -> FloatArray:

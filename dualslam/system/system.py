@@ -118,7 +118,6 @@ class System:
             self._connections,
             config.recovery,
             self._state.front_ends,
-            components.prior,
         )
         self._calibrations = Calibrations(self._state, self._recoveries, self._connections)
         self._shutter_watch = ShutterWatch(self._state, self._recoveries, self._connections)

@@ -62,8 +62,6 @@ class Tracking:
         seen = None if state.localises else FrameObservations.of(track.view.features, track.landmark_ids, submap.id)
         state.record.pose(pose, track.n_matches, track.n_inliers, seen, track.method)
         self._last_pose = pose
-        if state.parts.prior is not None:
-            state.parts.prior.note(view.timestamp_s, track.T_cam_submap[:3, :3].T, submap.id)
         if track.method is not FrameMethod.DIRECT:  # a pixel matcher has compared the images, and knows their blur
             with state.record.timer.measure("audit of images"):
                 state.audit.take(submap, track)

@@ -228,7 +228,6 @@ class PoseFinder:
             self._camera.size_px,
             self._adjuster,
             self._config.seed,
-            self._live.turn_to(view),
         )
         wide = self._judge(view, found)
         if not isinstance(wide, Failure):

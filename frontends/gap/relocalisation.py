@@ -24,7 +24,6 @@ from dualslam.core.errors import SolverError
 from dualslam.core.geometry import se3
 from dualslam.core.geometry.projection import projection_jacobians
 from dualslam.core.geometry.triangulation import triangulate_n_view, triangulate_two_view
-from dualslam.core.motion_prior import Turn
 from dualslam.core.noise_model import MIN_CONSENSUS
 from dualslam.core.types import BoolArray, Failure, FailureReason, FloatArray
 from dualslam.frontends.gap.auxiliary_map import TrackViews, triangulate
@@ -62,14 +61,12 @@ def relocalise_across_gap(
     size_px: tuple[int, int],
     adjuster: BundleAdjuster,
     seed: int,
-    turn: Turn | None = None,
 ) -> GapPose | Failure:
     """Estimate the pose of a frame.
 
     - `K` (3, 3), `size_px` (width, height).
     - `known`: each track in the frames of known pose; every track is seen in at least one.
     - `uv_px` (N, 2), `sigma_px` (N,): the tracks in the new frame.
-    - `turn`: its rotation from the axes of the known poses, if other sensors know it. No pose may contradict it.
     """
     n = len(uv_px)
     if n < MIN_CONSENSUS:
@@ -79,19 +76,15 @@ def relocalise_across_gap(
         _from_two_views(known, uv_px, sigma_px, K, size_px, seed),
     ]
     best: GapPose | None = None
-    why = Failure(FailureReason.DEGENERATE, f"{n} wide matches fix no pose")
     for T_cam_submap in hypotheses:
         if T_cam_submap is None:
             continue
         found = _adjust(known, uv_px, sigma_px, K, T_cam_submap, adjuster)
-        if found is not None and turn is not None:
-            refused = turn.refuse(found.T_cam_submap[:3, :3].T, found.covariance)
-            if refused is not None:
-                why = refused
-                continue
         if found is not None and (best is None or found.inliers.sum() > best.inliers.sum()):
             best = found
-    return why if best is None else best
+    if best is None:
+        return Failure(FailureReason.DEGENERATE, f"{n} wide matches fix no pose")
+    return best
 
 
 def _from_points(

@@ -16,7 +16,6 @@ from dualslam.core.config.settings import TrackingConfig
 from dualslam.core.geometry import se3, sim3
 from dualslam.core.geometry.projection import PoseEstimate, project_points, refine_pose
 from dualslam.core.interfaces import Frontend
-from dualslam.core.motion_prior import MotionPrior, Turn
 from dualslam.core.noise_model import MIN_CONSENSUS
 from dualslam.core.types import Failure, FailureReason, FloatArray, IntArray, Track, View
 from dualslam.frontends.features.matching import FeatureGrid, match_projected
@@ -68,8 +67,7 @@ class Tracker:
     `looks_everywhere`: wide matching also tries the keyframes that show the most of the map.
     `max_gap_scale_sigma`: largest standard deviation (relative) of the scale beyond frames that wide matching has
     skipped. Above it the frame counts as lost, unless the step is small against the depth of the scene. `pixels`: finds
-    landmarks where guided search finds too few; without it wide matching comes next. `prior`: predicts rotations, and
-    refuses what wide matching finds against it.
+    landmarks where guided search finds too few; without it wide matching comes next.
     """
 
     def __init__(
@@ -82,10 +80,8 @@ class Tracker:
         looks_everywhere: bool = False,
         max_gap_scale_sigma: float = 0.025,
         pixels: PixelSearch | None = None,
-        prior: MotionPrior | None = None,
     ) -> None:
         self._pixels = pixels
-        self._prior = prior
         self._frontend = frontend
         self._max_gap_scale_sigma = max_gap_scale_sigma
         self._config = config
@@ -142,8 +138,6 @@ class Tracker:
             return Failure(FailureReason.NO_TEXTURE, f"{len(features)} features in the image")
         grid = FeatureGrid.build(features.uv_rect_px)
         T_predicted = self._motion.predict(self._last, view.timestamp_s)
-        turn = self.turn_to(view)
-        T_predicted = T_predicted if turn is None else turn.of(T_predicted)
         found: tuple[FloatArray, IntArray] | Failure = Failure(FailureReason.TOO_FEW_MATCHES)
         for radius_px in (SEARCH_RADIUS_PX, SEARCH_RADIUS_PX * WIDER):
             found = self._pose_from_last(view, grid, T_predicted, radius_px)
@@ -168,21 +162,12 @@ class Tracker:
             return outcome
         if wide:
             refused = refuse_lost_scale(self._submap, outcome, self._last, self._max_gap_scale_sigma)
-            if refused is None and turn is not None:
-                refused = turn.refuse(outcome.T_cam_submap[:3, :3].T, outcome.covariance)
             if refused is None:
                 refused = self._refuse_look_alike(outcome)
             if refused is not None:
                 return refused
         self._accept(outcome, local)
         return outcome
-
-    def turn_to(self, view: View) -> Turn | None:
-        """Return the rotation from the submap's axes to a view's camera, if other sensors know it."""
-        if self._prior is None or self._last is None:
-            return None
-        turn = self._prior.turn(self._last.view.timestamp_s, view.timestamp_s)
-        return None if turn is None else turn.after(self._last.T_cam_submap[:3, :3].T)
 
     def lies_beyond_gap(self, view: View) -> bool:
         """Whether so much time has passed since the last posed frame that its motion does not lead to this one."""

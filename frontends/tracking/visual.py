@@ -16,7 +16,6 @@ from dualslam.core.decisions import Ruling
 from dualslam.core.estimates import GraphEstimate, KeyframeReport
 from dualslam.core.geometry import se3
 from dualslam.core.interfaces import N_WINDOW, Frontend, SubmapGraph, WindowSolver
-from dualslam.core.motion_prior import MotionPrior, Turn
 from dualslam.core.types import Failure, FailureReason, FloatArray, FrameMethod, IntArray, Rival, Track, View
 from dualslam.frontends.gap.refinding import Refinder
 from dualslam.frontends.gap.uncertainty import track_uncertainty
@@ -46,8 +45,8 @@ class VisualFrontEnd:
 
     `camera`: as it was given; it says what an image shows. `refinder`: finds landmarks across gaps in the images
     themselves; without it features alone tie the keyframes there. `looks_everywhere`: see `Tracker`. `window`: poses
-    new keyframes before the map grows about them; without it the graph does. `pixels`, `prior`: see `Tracker`.
-    `first_id`: number of this run's first frame; keyframes before it are those of the saved map that it continues.
+    new keyframes before the map grows about them; without it the graph does. `pixels`: see `Tracker`. `first_id`:
+    number of this run's first frame; keyframes before it are those of the saved map that it continues.
     """
 
     def __init__(
@@ -57,12 +56,12 @@ class VisualFrontEnd:
         submap: Submap,
         graph: SubmapGraph,
         camera: Camera,
+        *,
         refinder: Refinder | None = None,
         looks_everywhere: bool = False,
         window: WindowSolver | None = None,
         first_id: int = 0,
         pixels: PixelSearch | None = None,
-        prior: MotionPrior | None = None,
     ) -> None:
         self.submap = submap
         self.graph = graph
@@ -77,7 +76,6 @@ class VisualFrontEnd:
             looks_everywhere,
             config.linking.max_live_scale_sigma,  # all that is mapped beyond inherits it
             pixels,
-            prior,
         )
         self._mapper = Mapper(frontend, config.mapping, submap, camera)
         self._refinder = refinder
@@ -144,10 +142,6 @@ class VisualFrontEnd:
     def follow(self, view: View) -> Track | Failure:
         """Pose the frame next to the last one, by guided matching alone."""
         return self._noted(view, self._tracker.track(view, may_relocalise=False))
-
-    def turn_to(self, view: View) -> Turn | None:
-        """Return the rotation from the submap's axes to a view's camera, if other sensors know it."""
-        return self._tracker.turn_to(view)
 
     def lies_beyond_gap(self, view: View) -> bool:
         """Whether the motion of the last frames does not lead to this one: others between them are missing."""
