@@ -17,6 +17,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import sparse
+from scipy.spatial.distance import cdist
 
 from dualslam.core.geometry import se3
 from dualslam.core.geometry.alignment import COVARIANCE_INFLATION
@@ -38,9 +39,6 @@ SLACK = 1e-12
 """Relative to a block of the normal equations: what keeps a point without parallax from being singular."""
 NO_TIE = 1e-7
 """Relative to the median stiffness: directions that are softer than this are as free as the gauge."""
-MIN_SIZE = 0.25
-"""Of the median stretch's size: the error of smaller ones is counted against this. A camera at rest has no path that
-could have a wrong size."""
 
 
 def scale_sigma_between(submap: Submap, here: IntArray, there: IntArray) -> float:
@@ -69,25 +67,30 @@ def scale_sigmas_in_all(
     return [SCALE_INFLATION * sigma for sigma in answer_scale(_ask_all(submap, places, excess))]
 
 
-def path_sigmas(submap: Submap, stretches: Sequence[IntArray], excess: Mapping[int, float]) -> FloatArray:
-    """Return the standard deviations (S,) of the log of the size of stretches of the path, against the whole path's.
+def relative_scales(
+    submap: Submap, stretches: Sequence[IntArray], places: Sequence[IntArray], excess: Mapping[int, float]
+) -> FloatArray:
+    """Return the standard deviations (S + P, S + P) of the log of the ratio of scales between any two parts of a map.
 
-    The size is the RMS distance of a stretch's keyframes from their centre. Infinite where nothing ties a stretch to
-    the rest.
+    By all that it has seen, as `scale_sigmas_in_all`. The scale of a stretch is the size of its path: the RMS distance
+    of its keyframes from their centre. That of a place, where a link stands, is the one at which it sees its points.
+    Infinite where nothing ties two parts to each other.
 
-    - `stretches`: keyframe ids of each, two at least.
+    - `stretches`, `places`: keyframe ids of each; two at least in a stretch.
     - `excess`: of `noise_excess`.
     """
-    ids = np.array(sorted(submap.keyframes), np.int64)
+    ids, n = np.array(sorted(submap.keyframes), np.int64), len(stretches) + len(places)
     problem = _linearise(_ask_all(submap, [(ids, ids)], excess))
     if problem is None:
-        return np.full(len(stretches), np.inf)
+        return np.where(np.eye(n, dtype=bool), 0.0, np.inf)
     free, root = _directions(problem.reduced)
-    of_whole, _ = _size_at(problem, ids)
-    g, sizes = (np.array(x) for x in zip(*(_size_at(problem, part) for part in stretches), strict=True))
-    g = (g - of_whole) * (sizes / np.maximum(sizes, MIN_SIZE * np.median(sizes)))[:, None]
-    sigmas = SCALE_INFLATION * np.sqrt(COVARIANCE_INFLATION * ((g @ root) ** 2).sum(1))
-    return np.where(((g @ free) ** 2 > SLACK).any(1), np.inf, sigmas)
+    seen = [_scale_at(problem, place) for place in places]
+    by_points = [np.full(len(root), np.nan) if each is None else _by_poses(problem, *each) for each in seen]
+    g = np.array([*(_size_at(problem, part) for part in stretches), *by_points])
+    between = np.asarray(SCALE_INFLATION * np.sqrt(COVARIANCE_INFLATION) * cdist(g @ root, g @ root), np.float64)
+    between[~(cdist(g @ free, g @ free, "sqeuclidean") <= SLACK)] = np.inf
+    np.fill_diagonal(between, 0.0)
+    return between
 
 
 def _ask_all(submap: Submap, places: Sequence[tuple[IntArray, IntArray]], excess: Mapping[int, float]) -> ScaleQuestion:
@@ -159,13 +162,12 @@ def _sigma(problem: _Problem, free: FloatArray, root: FloatArray, here: IntArray
     g = [_scale_at(problem, ids) for ids in (there, here)]
     if g[0] is None or g[1] is None:
         return np.inf
-    g_pose, g_point = g[0][0] - g[1][0], g[0][1] - g[1][1]
-    # The points are eliminated: what remains of the functional is one of the poses.
-    through = np.einsum("nij,nj->ni", problem.inverse, g_point)
-    g_pose = g_pose - problem.H_cross @ through.reshape(-1)
+    g_point = g[0][1] - g[1][1]
+    g_pose = _by_poses(problem, g[0][0] - g[1][0], g_point)
     if ((g_pose @ free) ** 2 > SLACK).any():
         return np.inf
-    variance = float((g_point * through).sum() + ((g_pose @ root) ** 2).sum())
+    of_points = np.einsum("ni,nij,nj->", g_point, problem.inverse, g_point)
+    variance = float(of_points + ((g_pose @ root) ** 2).sum())
     return float(np.sqrt(COVARIANCE_INFLATION * max(variance, 0.0)))
 
 
@@ -242,8 +244,14 @@ def _scale_at(problem: _Problem, ids: IntArray) -> tuple[FloatArray, FloatArray]
     return g_pose.reshape(-1), g_point
 
 
-def _size_at(problem: _Problem, ids: IntArray) -> tuple[FloatArray, float]:
-    """Return the derivative (6 F,) of the log of the path's size at some keyframes by the poses, and the size."""
+def _by_poses(problem: _Problem, g_pose: FloatArray, g_point: FloatArray) -> FloatArray:
+    """Return a functional's derivative by the poses (6 F,) when the points follow them."""
+    follows = np.einsum("nij,nj->ni", problem.inverse, g_point)
+    return np.asarray(g_pose - problem.H_cross @ follows.reshape(-1), np.float64)
+
+
+def _size_at(problem: _Problem, ids: IntArray) -> FloatArray:
+    """Return the derivative (6 F,) of the log of the path's size at some keyframes by the poses."""
     rows = np.searchsorted(problem.ids, ids)
     T = problem.T_cam_submap[rows]
     offset = se3.inverse(T)[:, :3, 3]
@@ -251,4 +259,4 @@ def _size_at(problem: _Problem, ids: IntArray) -> tuple[FloatArray, float]:
     squares = max(float((offset**2).sum()), np.finfo(float).tiny)
     by_pose = np.zeros((len(problem.ids), 6))
     by_pose[rows, 3:] = -np.einsum("nij,nj->ni", T[:, :3, :3], offset) / squares
-    return by_pose.reshape(-1), float(np.sqrt(squares / len(ids)))
+    return by_pose.reshape(-1)

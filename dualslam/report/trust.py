@@ -37,7 +37,7 @@ def trust_section(run: RunData) -> Markup:
         _strip(
             run,
             [row.sigma_scale for row in run.rows],
-            "sigma of the size of two seconds of the path, against the whole",
+            "sigma of the size of two seconds of the path, against the best-tied ones",
             "Above it they may be 20 % too large or too small.",
             UNSURE_SCALE,
         ),

@@ -7,15 +7,15 @@ or posed again later. A frame claims what the keyframe does that it hangs on.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
-from dualslam.atlas.atlas import Atlas
+from dualslam.atlas.atlas import Atlas, Link
 from dualslam.core.geometry import se3
-from dualslam.core.noise_model import GROUP
+from dualslam.core.noise_model import GATE_SIGMAS, GROUP, UNSURE_SCALE
 from dualslam.core.types import FloatArray, IntArray
-from dualslam.linking.scale_observability import path_sigmas
+from dualslam.linking.scale_observability import relative_scales
 from dualslam.map.landmark_views import landmark_covariances, noise_excess, resection_covariance
 from dualslam.map.submap import Submap
 
@@ -35,50 +35,100 @@ class Claim:
     sigma_position_rel: float
     """Standard deviation of the position against what the keyframe sees, over the median depth of that."""
     sigma_scale: float
-    """Standard deviation of the logarithm of the size of the path about the keyframe, against that of the whole path:
-    by how much it may be too large or too small. Infinite where nothing ties it to the rest."""
+    """Standard deviation of the logarithm of the size of the path about the keyframe, against that of the best-tied
+    stretch: by how much it may be too large or too small. Infinite where nothing ties it to that one."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Known:
+    """What a submap knows of its keyframes, and of the scales about them and at its links against each other."""
+
+    sigma_position_rel: dict[int, float]  # by keyframe
+    between: FloatArray  # (S + P, S + P): of `relative_scales`: of the stretches about keyframes, then of links' places
+    share: FloatArray
+    """(S,): of the size of each stretch in the shortest one that can be measured."""
+    place_of: dict[int, int]  # of each link its row in `between`
+
+    @property
+    def best_tied(self) -> int:
+        """The stretch that the others are tied to best, in the median: its row."""
+        n = len(self.share)
+        return int(np.argmin(np.median(self.between[:n, :n], axis=1)))
+
+    def claims(self, row: int, variance: float) -> dict[int, Claim]:
+        """Return the claims by keyframe, with their scales against a stretch or place that is known with a variance."""
+        sigmas = self.share * np.sqrt(self.between[: len(self.share), row] ** 2 + variance)
+        positions = self.sigma_position_rel.items()
+        return {k: Claim(position, sigma) for (k, position), sigma in zip(positions, sigmas.tolist(), strict=True)}
 
 
 def claims_in_atlas(atlas: Atlas) -> dict[int, dict[int, Claim]]:
-    """Return the claims of all submaps, with their scales against the largest submap that each is linked to."""
-    claims = {m: claims_of(submap) for m, submap in atlas.submaps.items()}
+    """Return the claims of all submaps, with their scales against the best-tied stretch of those that are linked.
+
+    That stretch is in the largest submap. The scales of others are known along the best links to it. A link is measured
+    at one place of either submap: how well the scale of that is known adds to the link's own variance.
+    """
+    claims: dict[int, dict[int, Claim]] = {}
     for component in atlas.components():
-        variance = _scale_variances(atlas, component, claims)
+        links = dict(enumerate(link for link in atlas.believed if link.a != link.b and link.a in component))
+        known = {}
         for m in component:
-            for k, claim in claims[m].items():
-                claims[m][k] = replace(claim, sigma_scale=float(np.sqrt(claim.sigma_scale**2 + variance[m])))
+            submap = atlas.submaps[m]
+            places = {n: _place(atlas, link, submap) for n, link in links.items() if m in (link.a, link.b)}
+            known[m] = _ask(submap, places)
+        largest = max(component, key=lambda m: len(atlas.submaps[m].keyframes))
+        claims |= {m: known[m].claims(*seen) for m, seen in _seen_from(largest, known, links).items()}
     return claims
 
 
-def _scale_variances(atlas: Atlas, component: list[int], claims: Mapping[int, Mapping[int, Claim]]) -> dict[int, float]:
-    """Return the variance of the log of each submap's scale against the largest's, along the best links.
-
-    A link is measured at one place of either submap. How well the scale is known there adds to its own variance.
-    """
-    steps = []
-    for link in atlas.believed:
-        if link.a != link.b and link.a in component:
-            at = zip((link.a, link.b), link.attached(atlas), strict=True)
-            sigmas = [link.sigma_scale, *(claims[m][k].sigma_scale for m, k in at)]
-            steps.append((link.a, link.b, float(np.nansum(np.square(sigmas)))))
-    largest = max(component, key=lambda m: len(atlas.submaps[m].keyframes))
-    variance = {m: 0.0 if m == largest else np.inf for m in component}
-    for _ in component:
-        for a, b, more in steps:
-            variance[a], variance[b] = min(variance[a], variance[b] + more), min(variance[b], variance[a] + more)
-    return variance
+def _seen_from(largest: int, known: Mapping[int, _Known], links: Mapping[int, Link]) -> dict[int, tuple[int, float]]:
+    """Return for each submap the row of the stretch or place by which its scale is known, and the variance of that."""
+    seen = {largest: (known[largest].best_tied, 0.0)}
+    while len(seen) < len(known):
+        ways = []
+        for n, link in links.items():
+            for a, b in ((link.a, link.b), (link.b, link.a)):
+                if a in seen and b not in seen:
+                    row, variance = seen[a]
+                    lost = float(known[a].between[row, known[a].place_of[n]])
+                    ways.append((variance + lost**2 + link.sigma_scale**2, b, known[b].place_of[n]))
+        variance, m, row = min(ways)
+        seen[m] = row, variance
+    return seen
 
 
 def claims_of(submap: Submap) -> dict[int, Claim]:
-    """Return what a submap claims of its keyframes, with their scales against its own whole path."""
-    excess = noise_excess(submap)
-    ids = sorted(submap.keyframes)
-    scale, covariances = _scale_sigmas(submap, excess), landmark_covariances(submap, np.arange(len(submap.landmarks)))
-    claims = {}
-    for n, k in enumerate(ids):
-        near = max(excess[other] for other in ids[max(n - NEAR, 0) : n + NEAR + 1])
-        claims[k] = Claim(near * _position_sigma(submap, k, covariances), scale[k])
-    return claims
+    """Return what a submap claims of its keyframes by itself."""
+    atlas = Atlas()
+    atlas.add(submap)
+    return claims_in_atlas(atlas)[submap.id]
+
+
+def _place(atlas: Atlas, link: Link, submap: Submap) -> IntArray:
+    """Return a submap's keyframes by which a link was measured: those that both have, or those about its place."""
+    shared = [k for k in link.keyframes if k in submap.keyframes]
+    at = link.attached(atlas)[link.b == submap.id]
+    return np.array(sorted(shared or submap.keyframes_near(at)[:GROUP]), np.int64)
+
+
+def _ask(submap: Submap, places: Mapping[int, IntArray]) -> _Known:
+    """Ask a submap what it knows; of its scales nothing is known where it is short. `places`: by link."""
+    excess, ids = noise_excess(submap), sorted(submap.keyframes)
+    covariances = landmark_covariances(submap, np.arange(len(submap.landmarks)))
+    usual = {k: _position_sigma(submap, k, covariances) for k in ids}
+    near = [max(excess[other] for other in ids[max(n - NEAR, 0) : n + NEAR + 1]) for n in range(len(ids))]
+    positions = {k: more * sigma for more, (k, sigma) in zip(near, usual.items(), strict=True)}
+    place_of = {n: len(ids) + row for row, n in enumerate(places)}
+    if len(ids) <= GROUP or not submap.landmarks["alive"].any():
+        n_parts = len(ids) + len(places)
+        return _Known(positions, np.zeros((n_parts, n_parts)), np.full(len(ids), np.nan), place_of)
+    stretches = list(stretches_of(submap).values())
+    sizes_mu = np.array([np.linalg.norm(submap.keyframe_poses(s)[:, :3, 3].std(axis=0)) for s in stretches])
+    depths_mu = np.array([np.median(submap.depths_in(k)) if len(submap.seen_in(k)) else np.nan for k in ids])
+    measurable_mu = GATE_SIGMAS / UNSURE_SCALE * np.nanmedian(list(usual.values())) * depths_mu
+    share = np.minimum(sizes_mu / measurable_mu, 1.0)
+    between = relative_scales(submap, stretches, list(places.values()), excess)
+    return _Known(positions, between, share, place_of)
 
 
 def _position_sigma(submap: Submap, keyframe_id: int, covariances: FloatArray) -> float:
@@ -93,15 +143,6 @@ def _position_sigma(submap: Submap, keyframe_id: int, covariances: FloatArray) -
     depth = submap.depths(ids, T_cam_submap)
     variance = float(np.trace(covariance[3:, 3:]))
     return POSITION_INFLATION * float(np.sqrt(max(variance, 0.0)) / np.median(depth[depth > 0]))
-
-
-def _scale_sigmas(submap: Submap, excess: dict[int, float]) -> dict[int, float]:
-    """Ask for the stretch about each keyframe how well its size is known against that of the whole path."""
-    stretches = stretches_of(submap)
-    if len(stretches) <= GROUP or not submap.landmarks["alive"].any():
-        return dict.fromkeys(stretches, float("nan"))
-    sigmas = path_sigmas(submap, list(stretches.values()), excess)
-    return dict(zip(stretches, sigmas.tolist(), strict=True))
 
 
 def stretches_of(submap: Submap) -> dict[int, IntArray]:

@@ -27,8 +27,7 @@ MIN_JUMP_DEPTHS = 0.02
 MIN_COVERAGE = 0.95
 """Share of the frames that can be posed."""
 MAX_UNSURE = 0.1
-"""Share of frames with an unsure scale. Where a camera turns on the spot, two seconds have no size to speak of: right
-runs of a hand-held camera that mostly turns have up to 6 %."""
+"""Share of frames with an unsure scale: right runs of a hand-held camera that mostly turns have up to 7 %."""
 MIN_COMPARED = 5
 """Keyframes by which two maps are compared: a similarity alone fits two of them, and most paths of three."""
 STOOD_S = 1.0

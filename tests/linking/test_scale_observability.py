@@ -18,14 +18,13 @@ from dualslam.linking import (
     estimate,
     estimate_link,
     propagate_to_live_end,
-    scale_observability,
 )
 from dualslam.linking.correspondences import propose_correspondences
 from dualslam.linking.estimate import LinkRefusal
 from dualslam.linking.gates import MIN_TIES, MINORITY_DEFORMATION
 from dualslam.linking.join_test import LinkEvidence
 from dualslam.linking.pairs import PairModel
-from dualslam.linking.scale_observability import path_sigmas, scale_sigma_between, scale_sigmas_in_all
+from dualslam.linking.scale_observability import relative_scales, scale_sigma_between, scale_sigmas_in_all
 from dualslam.linking.verify import judge_parting
 from dualslam.map.solving import solve
 from dualslam.map.submap import Submap
@@ -85,8 +84,8 @@ def test_the_sigma_is_that_of_the_error(layout: str) -> None:
         world, submap = solved(layout, seed)
         sigma = scale_sigma_between(submap, HERE, THERE)
         of_depths.append((log_scale(world, submap, THERE) - log_scale(world, submap, HERE)) / sigma)
-        error = log_size(world, submap, THERE) - log_size(world, submap, np.array(sorted(submap.keyframes)))
-        of_path.append(error / path_sigmas(submap, [THERE], EXACT)[0])
+        error = log_size(world, submap, THERE) - log_size(world, submap, HERE)
+        of_path.append(error / relative_scales(submap, [HERE, THERE], [], EXACT)[0, 1])
     assert 0.2 < np.sqrt(np.mean(np.square(of_depths))) < 2.0, of_depths
     assert 0.2 < np.sqrt(np.mean(np.square(of_path))) < 2.0, of_path
 
@@ -96,21 +95,22 @@ def test_the_way_can_be_unsure_where_the_depths_are_firm() -> None:
     ids = np.array(sorted(submap.keyframes))
     middle = ids[10:14]
     noise = EXACT | dict.fromkeys(middle.tolist(), 10.0)
-    (depths,), (way,) = scale_sigmas_in_all(submap, [(middle, ids)], noise), path_sigmas(submap, [middle], noise)
+    (depths,) = scale_sigmas_in_all(submap, [(middle, ids)], noise)
+    between = relative_scales(submap, [middle, ids], [middle], noise)
     assert depths < 0.005
-    assert way > 0.03
-    assert path_sigmas(submap, [middle], EXACT)[0] < way / 3
+    assert between[1, 2] < 0.01, "the place where a link would stand"
+    assert between[0, 1] > 0.03
+    assert relative_scales(submap, [middle, ids], [], EXACT)[0, 1] < between[0, 1] / 3
 
 
-def test_a_stretch_that_hardly_moves_is_counted_against_the_others_size(monkeypatch: pytest.MonkeyPatch) -> None:
-    _, submap = solved("street", 0)
+def test_a_break_in_the_middle_leaves_each_half_unsure_against_the_other_alone() -> None:
+    submap = thinned(solved("street", 0)[1], 12 * FRAME_STEP, 4)
     ids = np.array(sorted(submap.keyframes))
-    stretches = [ids[10:12], ids[:12], ids[6:18], ids[12:]]
-    counted = path_sigmas(submap, stretches, EXACT)
-    monkeypatch.setattr(scale_observability, "MIN_SIZE", 0.0)
-    of_itself = path_sigmas(submap, stretches, EXACT)
-    assert counted[0] < of_itself[0]
-    assert counted[1:] == pytest.approx(of_itself[1:])
+    between = relative_scales(submap, [ids[:6], ids[6:12], ids[12:18], ids[18:], ids], [], EXACT)
+    assert between == pytest.approx(between.T)
+    across = between[:2, 2:4].min()
+    assert max(between[0, 1], between[2, 3]) < 0.7 * across
+    assert between[:4, 4].max() < across, "the whole has a part in the error of either"
 
 
 def test_fewer_ties_hold_less_and_none_hold_nothing() -> None:
@@ -124,9 +124,9 @@ def test_fewer_ties_hold_less_and_none_hold_nothing() -> None:
 
 def test_the_unit_does_not_matter() -> None:
     _, submap = solved("room", 1)
-    before = scale_sigma_between(submap, HERE, THERE), path_sigmas(submap, [THERE], EXACT)[0]
+    before = scale_sigma_between(submap, HERE, THERE), relative_scales(submap, [HERE, THERE], [], EXACT)[0, 1]
     submap.transform(7.0, se3.exp(np.array([0.3, -0.2, 0.5, 3.0, 1.0, -2.0])))
-    after = scale_sigma_between(submap, HERE, THERE), path_sigmas(submap, [THERE], EXACT)[0]
+    after = scale_sigma_between(submap, HERE, THERE), relative_scales(submap, [HERE, THERE], [], EXACT)[0, 1]
     assert after == pytest.approx(before, rel=1e-3)
 
 
