@@ -13,7 +13,7 @@ import numpy as np
 
 from dualslam.atlas.atlas import Atlas, Link
 from dualslam.core.geometry import se3
-from dualslam.core.noise_model import GATE_SIGMAS, GROUP, UNSURE_SCALE
+from dualslam.core.noise_model import GATE_SIGMAS, GROUP, MIN_DEPTH_MU, UNSURE_SCALE
 from dualslam.core.types import FloatArray, IntArray
 from dualslam.linking.scale_observability import relative_scales
 from dualslam.map.landmark_views import landmark_covariances, noise_excess, resection_covariance
@@ -58,24 +58,19 @@ class _Known:
     def claims(self, row: int, variance: float) -> dict[int, Claim]:
         """Return the claims by keyframe, with their scales against a stretch or place that is known with a variance."""
         sigmas = self.share * np.sqrt(self.between[: len(self.share), row] ** 2 + variance)
-        positions = self.sigma_position_rel.items()
-        return {k: Claim(position, sigma) for (k, position), sigma in zip(positions, sigmas.tolist(), strict=True)}
+        known = map(Claim, self.sigma_position_rel.values(), sigmas.tolist())
+        return dict(zip(self.sigma_position_rel, known, strict=True))
 
 
 def claims_in_atlas(atlas: Atlas) -> dict[int, dict[int, Claim]]:
     """Return the claims of all submaps, with their scales against the best-tied stretch of those that are linked.
 
-    That stretch is in the largest submap. The scales of others are known along the best links to it. A link is measured
-    at one place of either submap: how well the scale of that is known adds to the link's own variance.
+    It is in the largest submap. Along the best links to it, variances add: of each link, and between the links' places.
     """
     claims: dict[int, dict[int, Claim]] = {}
     for component in atlas.components():
         links = dict(enumerate(link for link in atlas.believed if link.a != link.b and link.a in component))
-        known = {}
-        for m in component:
-            submap = atlas.submaps[m]
-            places = {n: _place(atlas, link, submap) for n, link in links.items() if m in (link.a, link.b)}
-            known[m] = _ask(submap, places)
+        known = {m: _ask(atlas, atlas.submaps[m], links) for m in component}
         largest = max(component, key=lambda m: len(atlas.submaps[m].keyframes))
         claims |= {m: known[m].claims(*seen) for m, seen in _seen_from(largest, known, links).items()}
     return claims
@@ -111,24 +106,23 @@ def _place(atlas: Atlas, link: Link, submap: Submap) -> IntArray:
     return np.array(sorted(shared or submap.keyframes_near(at)[:GROUP]), np.int64)
 
 
-def _ask(submap: Submap, places: Mapping[int, IntArray]) -> _Known:
-    """Ask a submap what it knows; of its scales nothing is known where it is short. `places`: by link."""
+def _ask(atlas: Atlas, submap: Submap, links: Mapping[int, Link]) -> _Known:
+    """Ask a submap what it knows; of its scales nothing is known where it is short."""
+    places = {n: _place(atlas, link, submap) for n, link in links.items() if submap.id in (link.a, link.b)}
     excess, ids = noise_excess(submap), sorted(submap.keyframes)
     covariances = landmark_covariances(submap, np.arange(len(submap.landmarks)))
     usual = {k: _position_sigma(submap, k, covariances) for k in ids}
-    near = [max(excess[other] for other in ids[max(n - NEAR, 0) : n + NEAR + 1]) for n in range(len(ids))]
-    positions = {k: more * sigma for more, (k, sigma) in zip(near, usual.items(), strict=True)}
-    place_of = {n: len(ids) + row for row, n in enumerate(places)}
+    near = {k: max(excess[other] for other in ids[max(n - NEAR, 0) : n + NEAR + 1]) for n, k in enumerate(ids)}
+    positions = {k: near[k] * sigma for k, sigma in usual.items()}
+    place_of, n_parts = {n: len(ids) + row for row, n in enumerate(places)}, len(ids) + len(places)
     if len(ids) <= GROUP or not submap.landmarks["alive"].any():
-        n_parts = len(ids) + len(places)
         return _Known(positions, np.zeros((n_parts, n_parts)), np.full(len(ids), np.nan), place_of)
     stretches = list(stretches_of(submap).values())
-    sizes_mu = np.array([np.linalg.norm(submap.keyframe_poses(s)[:, :3, 3].std(axis=0)) for s in stretches])
-    depths_mu = np.array([np.median(submap.depths_in(k)) if len(submap.seen_in(k)) else np.nan for k in ids])
-    measurable_mu = GATE_SIGMAS / UNSURE_SCALE * np.nanmedian(list(usual.values())) * depths_mu
-    share = np.minimum(sizes_mu / measurable_mu, 1.0)
+    size_mu = np.array([np.linalg.norm(submap.keyframe_poses(s)[:, :3, 3].std(axis=0)) for s in stretches])
+    depth_mu = np.array([np.median(submap.depths_in(k)) if len(submap.seen_in(k)) else MIN_DEPTH_MU for k in ids])
+    measurable_mu = GATE_SIGMAS / UNSURE_SCALE * np.nanmedian(list(usual.values())) * depth_mu
     between = relative_scales(submap, stretches, list(places.values()), excess)
-    return _Known(positions, between, share, place_of)
+    return _Known(positions, between, np.minimum(size_mu / measurable_mu, 1.0), place_of)
 
 
 def _position_sigma(submap: Submap, keyframe_id: int, covariances: FloatArray) -> float:
