@@ -73,11 +73,7 @@ def all_after(frames: float) -> After:
     return After(dict.fromkeys(DELAYS, frames))
 
 
-@pytest.mark.parametrize(
-    "schedule",
-    first_of([all_after(5), After(), *(all_after(frames) for frames in (0, math.inf))]),
-    ids=["5", "default", "0", "never"],
-)
+@pytest.mark.parametrize("schedule", first_of([all_after(5), all_after(math.inf)]), ids=["5", "never"])
 def test_a_run_with_a_loss_is_right_under_a_schedule_and_repeats_to_the_bit(schedule: Policy) -> None:
     system, world, record = run(schedule)
     assert_one_right_map(system, world)
@@ -88,6 +84,12 @@ def test_a_run_with_a_loss_is_right_under_a_schedule_and_repeats_to_the_bit(sche
 @pytest.mark.parametrize("kinds", [[GRAPH], [CALIBRATION], [WALK], OF_THE_ATLAS])
 def test_whichever_answers_come_at_the_end_alone(kinds: Sequence[JobKind]) -> None:
     system, world, _ = run(After({**DELAYS, **dict.fromkeys(kinds, math.inf)}))
+    assert_one_right_map(system, world)
+
+
+@pytest.mark.slow
+def test_answers_may_come_with_the_next_frame() -> None:
+    system, world, _ = run(all_after(0))
     assert_one_right_map(system, world)
 
 
@@ -131,14 +133,13 @@ def test_whichever_workers_die_or_hang(kinds: Sequence[JobKind], reason: Failure
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", range(2))
-def test_answers_for_maps_that_are_gone(seed: int) -> None:
+def test_answers_for_maps_that_are_gone() -> None:
     """Three losses, the second map is hardly begun when it is lost; walks end long after their maps."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     covered = frozenset({*range(20, 30), *range(42, 52), *range(72, 82)})
     delays = {kind: float(rng.choice([0, 1, 5, 20, 40, math.inf])) for kind in DELAYS}
-    lossy = Lossy(list(DELAYS), every=7, seed=seed)
-    how = {"covered": covered, "seed": seed, "n": 98}
+    lossy = Lossy(list(DELAYS), every=7)
+    how = {"covered": covered, "n": 98}
     system, world, record = run(After(delays), lossy, **how)
     for submap in system.atlas.submaps.values():
         assert submap.keyframes.keys() == submap.T_submap_kf.keys() == submap.landmark_of.keys()

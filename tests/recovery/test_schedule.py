@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -67,6 +68,16 @@ def watched_system(world: PointWorld, polls: int = 0, **recovery: object) -> tup
     return system, watched
 
 
+@cache
+def stepped(retry_keyframes: tuple[int, ...]) -> tuple[System, WatchedWalks]:
+    """A run of `away_first` before its end; tests look at it and leave it as it is."""
+    world = away_first()
+    system, watched = watched_system(world, retry_keyframes=list(retry_keyframes))
+    for frame in world.frames():
+        system.step(frame)
+    return system, watched
+
+
 def assert_right(system: System, world: PointWorld, expected: Iterable[int]) -> None:
     main = trajectories_of(system).main
     assert main.index.tolist() == sorted(expected)
@@ -108,13 +119,9 @@ class TestFramesBeforeTheStart:
     @pytest.mark.slow
     def test_poses_that_were_there_stay_but_for_what_the_graph_moves(self) -> None:
         """They keep their keyframe, or a neighbour of it, and the map's shape."""
-        world = away_first()
-        alone, _ = watched_system(world, retry_keyframes=[])
-        helped, watched = watched_system(world, retry_keyframes=[8])
-        for system in (alone, helped):
-            for frame in world.frames():
-                system.step(frame)
-        assert len(watched.jobs) == 2
+        alone, first = stepped(())
+        helped, watched = stepped((8,))
+        assert (len(first.jobs), len(watched.jobs)) == (1, 2)
         a, b = (trajectories_of(system).main for system in (alone, helped))
         assert b.index.tolist()[N_BEHIND:] == a.index.tolist()
         translation, rotation = pose_errors(b.T_world_cam[N_BEHIND:], a.T_world_cam)
@@ -160,14 +167,8 @@ class TestFramesBeforeTheStart:
 
     @pytest.mark.slow
     def test_the_same_seed_gives_the_same_poses_bit_for_bit(self) -> None:
-        found = []
-        for _ in range(2):
-            world = away_first()
-            system, _ = watched_system(world, retry_keyframes=[8])
-            for frame in world.frames():
-                system.step(frame)
-            found.append(trajectories_of(system).main.T_world_cam)
-        assert np.array_equal(found[0], found[1])
+        first, again = (trajectories_of(run((8,))[0]).main for run in (stepped, stepped.__wrapped__))
+        assert np.array_equal(first.T_world_cam, again.T_world_cam)
 
 
 def test_what_is_lost_on_the_way_back_is_found_on_the_way_there() -> None:
@@ -345,10 +346,7 @@ def test_a_walk_reads_no_frame_that_is_older_than_the_lost_map() -> None:
 
 
 def test_few_keyframes_cover_the_map() -> None:
-    world = away_first()
-    system, _ = watched_system(world)
-    for frame in world.frames():
-        system.step(frame)
+    system, _ = stepped((8,))
     assert system.live is not None
     submap = system.live.submap
     seen = {k: set(ids[ids >= 0].tolist()) for k, ids in submap.landmark_of.items()}

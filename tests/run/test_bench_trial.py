@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 import shutil
-from dataclasses import replace
+from contextlib import redirect_stderr, redirect_stdout
+from dataclasses import dataclass, replace
+from io import StringIO
 from pathlib import Path
 
 import pytest
@@ -41,18 +43,31 @@ def trial(spec: BenchSpec) -> Trial:
     return trial
 
 
+@dataclass(frozen=True)
+class Done:
+    """A bench that the command has run: its folder, the only line, and what was printed."""
+
+    command: list[str]
+    out: Path
+    record: TrialRecord
+    printed: str
+    told: str
+
+
 @pytest.fixture(scope="module")
-def done(trial: Trial, tmp_path_factory: pytest.TempPathFactory) -> tuple[TrialRecord, Path]:
-    """The trial's line, and the folder of its bench."""
-    out = tmp_path_factory.mktemp("bench")
-    return run_trial(trial, str(out)), out
+def done(tmp_path_factory: pytest.TempPathFactory) -> Done:
+    folder = tmp_path_factory.mktemp("bench")
+    (folder / "tiny.yaml").write_text(SPEC)
+    command = ["bench", str(folder / "tiny.yaml"), "--out", str(folder / "out"), "--jobs", "1"]
+    with redirect_stdout(StringIO()) as printed, redirect_stderr(StringIO()) as told:
+        assert main(command) == 0
+    (record,) = TrialLog(folder / "out" / "trials.jsonl").records
+    return Done(command, folder / "out", record, printed.getvalue(), told.getvalue())
 
 
 @pytest.mark.slow
-def test_a_trial_is_a_run_folder_and_a_line(
-    spec: BenchSpec, trial: Trial, done: tuple[TrialRecord, Path], tmp_path: Path
-) -> None:
-    record, out = done
+def test_a_trial_is_a_run_folder_and_a_line(spec: BenchSpec, trial: Trial, done: Done, tmp_path: Path) -> None:
+    record, out = done.record, done.out
     assert record.outcome is TrialOutcome.DONE, record.error
     assert len(record.status) == 37
     assert record.initialised_at is not None
@@ -96,35 +111,27 @@ def test_a_bug_leaves_its_traceback_in_the_folder(
 
 
 @pytest.mark.slow
-def test_the_command_writes_tables_and_runs_nothing_twice(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    path, out = tmp_path / "tiny.yaml", tmp_path / "out"
-    path.write_text(SPEC)
-    command = ["bench", str(path), "--out", str(out), "--jobs", "1"]
-    assert main(command) == 0
-    captured = capsys.readouterr()
-    assert "### Table II: failures" in captured.out
-    assert "1/1 room/gap/base/00: good" in captured.err
-    lines, page = (out / "trials.jsonl").read_text(), (out / "tables.md").read_text()
-    assert main(command) == 0
-    captured = capsys.readouterr()
-    assert captured.err == ""
-    assert ((out / "trials.jsonl").read_text(), (out / "tables.md").read_text()) == (lines, page)
+def test_the_command_writes_tables_and_runs_nothing_twice(done: Done, capsys: pytest.CaptureFixture[str]) -> None:
+    assert "### Table II: failures" in done.printed
+    assert "1/1 room/gap/base/00: good" in done.told
+    lines, page = (done.out / "trials.jsonl").read_text(), (done.out / "tables.md").read_text()
+    assert main(done.command) == 0
+    assert capsys.readouterr().err == ""
+    assert ((done.out / "trials.jsonl").read_text(), (done.out / "tables.md").read_text()) == (lines, page)
 
 
 @pytest.mark.slow
-def test_a_cluster_gives_the_line_that_this_machine_gives(
-    trial: Trial, done: tuple[TrialRecord, Path], tmp_path: Path
-) -> None:
+def test_a_cluster_gives_the_line_that_this_machine_gives(trial: Trial, done: Done, tmp_path: Path) -> None:
     (tmp_path / "tiny.yaml").write_text(SPEC)
     out = tmp_path / "out"
     with dask_cluster(tmp_path) as cluster:
         command = ["bench", str(tmp_path / "tiny.yaml"), "--out", str(out), "--scheduler", cluster.address]
         assert main([*command, "--quiet"]) == 0
     (line,) = TrialLog(out / "trials.jsonl").records
-    here, folder = done
+    here = done.record
     assert here.outcome is TrialOutcome.DONE
     assert replace(here, wall_s=line.wall_s, cpu_s=line.cpu_s) == line
-    runs = [each / "trials" / trial.key / "trajectory.txt" for each in (out, folder)]
+    runs = [each / "trials" / trial.key / "trajectory.txt" for each in (out, done.out)]
     assert runs[0].read_bytes() == runs[1].read_bytes()
 
 

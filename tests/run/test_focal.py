@@ -17,6 +17,7 @@ from dualslam.core.camera.models import DivisionCamera, PinholeCamera
 from dualslam.core.config.settings import Config
 from dualslam.core.errors import InputError
 from dualslam.core.types import FloatArray
+from dualslam.frontends.tracking import focal_search
 from dualslam.io.map_store import save_atlas
 from dualslam.lab.synthetic import make_sequence
 from dualslam.run.focal import open_without_calibration, with_camera_found, with_camera_of_map, with_prior
@@ -29,6 +30,12 @@ def write(folder: Path, images: list[np.ndarray], exif: Image.Exif | bytes = b""
     for i, image in enumerate(images):
         Image.fromarray(image).save(folder / f"{i:04d}.png", exif=exif)
     return folder
+
+
+@pytest.fixture(autouse=True)
+def _few_pairs(monkeypatch: pytest.MonkeyPatch) -> None:
+    """For time's sake: they tell less, but enough for these worlds."""
+    monkeypatch.setattr(focal_search, "MAX_PAIRS", 12)
 
 
 @pytest.fixture(scope="module")

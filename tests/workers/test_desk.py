@@ -23,6 +23,7 @@ from dualslam.testing.point_world import PointWorld, cloud, hand_held
 from dualslam.testing.waiting import wait_until
 from dualslam.workers.desk import WorkerDesk
 from dualslam.workers.transport import Channel
+from tests.workers.test_worker import gone
 
 GRAPH, CALIBRATION, WALK = JobKind.GRAPH, JobKind.CALIBRATION, JobKind.WALK
 
@@ -201,20 +202,47 @@ def stop(desk: WorkerDesk) -> None:
 
 
 @pytest.mark.parametrize(
-    ("harm", "reason"),
-    [(kill, FailureReason.WORKER), pytest.param(stop, FailureReason.TIMEOUT, marks=pytest.mark.slow)],
+    ("harm", "reason", "detail"),
+    [
+        (kill, FailureReason.WORKER, "-9"),
+        pytest.param(stop, FailureReason.TIMEOUT, "", marks=pytest.mark.slow),
+    ],
 )
-def test_a_worker_that_dies_or_hangs_costs_its_job(harm: Callable[[WorkerDesk], None], reason: FailureReason) -> None:
+def test_a_worker_that_dies_or_hangs_costs_its_job(
+    harm: Callable[[WorkerDesk], None], reason: FailureReason, detail: str
+) -> None:
     with working(lane(GRAPH, time_limit_s=5.0)) as desk:
+        (pid,) = desk.pids
         harm(desk)
         desk.on_start = lambda kind, work, pid: None
         desk._queues[0].idle[0]._process.is_alive = lambda: True  # type: ignore[method-assign]  # it harms at work
         desk.submit(GRAPH, 5.0)
         desk.submit(GRAPH, 7.0)
         first, second = collect(desk, GRAPH, 2)
+        assert gone(pid)
+        assert desk.pids != [pid]
     assert reasons([first]) == [reason]
+    assert detail in first.result.detail
     assert second.result == 7.0  # a fresh one, without the state of the other
     assert desk.statistics[GRAPH].n_failed == 1
+
+
+def test_a_worker_that_died_while_idle_is_replaced() -> None:
+    with working(lane(GRAPH)) as desk:
+        kill(desk)
+        wait_until(lambda: not desk._queues[0].idle[0].alive)
+        desk.submit(GRAPH, 7.0)
+        assert collect(desk, GRAPH)[0].result == 7.0
+
+
+def test_the_end_of_a_run_waits_so_long_and_no_longer() -> None:
+    with working(lane(WALK), finish_wait_s=0.2) as desk:
+        (pid,) = desk.pids
+        stop(desk)
+        desk.submit(WALK, ("sleep", 0.0))
+        desk.submit(WALK, ("sleep", 0.0))
+        assert reasons(desk.drain(WALK)) == [FailureReason.TIMEOUT] * 2
+    assert gone(pid)
 
 
 def test_a_desk_says_when_its_workers_are_warm() -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import pickle
-import signal
 import time
 from collections.abc import Iterator
 from dataclasses import replace
@@ -18,7 +17,7 @@ from dualslam.core.config.settings import Config
 from dualslam.core.events import EventKind
 from dualslam.core.grey_image import GreyImage
 from dualslam.core.jobs import JobKind, Limit
-from dualslam.core.types import Failure, FailureReason, Frame, LateFrame
+from dualslam.core.types import Failure, Frame, LateFrame
 from dualslam.recovery.job import RecoveryJob, RecoveryResult
 from dualslam.recovery.reverse_tracking import run_recovery
 from dualslam.run.results import trajectories_of
@@ -148,57 +147,6 @@ def test_a_worker_finds_what_would_be_found_inline_and_stays_warm(
     assert desk.drain(JobKind.WALK) == []
     desk.close()
     assert gone(pids[0])
-
-
-def test_a_worker_that_is_killed_costs_its_job_only(desk: WorkerDesk, job: RecoveryJob) -> None:
-    (pid,) = desk.pids
-    desk.submit(JobKind.WALK, job)
-    desk.submit(JobKind.WALK, job)  # waits for its turn
-    assert pid is not None
-    os.kill(pid, signal.SIGKILL)
-    lost = wait_for(desk)
-    assert isinstance(lost, Failure)
-    assert lost.reason is FailureReason.WORKER
-    assert "-9" in lost.detail
-    assert isinstance(wait_for(desk), RecoveryResult)
-
-
-@pytest.mark.slow
-def test_a_worker_that_died_while_idle_is_replaced(desk: WorkerDesk, job: RecoveryJob) -> None:
-    (pid,) = desk.pids
-    assert pid is not None
-    os.kill(pid, signal.SIGKILL)
-    while desk._queues[0].idle[0].alive:
-        time.sleep(0.01)
-    desk.submit(JobKind.WALK, job)
-    assert isinstance(wait_for(desk), RecoveryResult)
-
-
-def test_a_worker_that_hangs_is_ended_after_its_time(job: RecoveryJob) -> None:
-    desk = walking_desk(time_limit_s=0.3)
-    (pid,) = desk.pids
-    assert pid is not None
-    os.kill(pid, signal.SIGSTOP)
-    desk.submit(JobKind.WALK, job)
-    lost = wait_for(desk)
-    assert isinstance(lost, Failure)
-    assert lost.reason is FailureReason.TIMEOUT
-    assert gone(pid)
-    assert desk.pids != [pid]
-    desk.close()
-
-
-def test_the_end_of_a_run_waits_so_long_and_no_longer(job: RecoveryJob) -> None:
-    desk = walking_desk(finish_wait_s=0.2)
-    (pid,) = desk.pids
-    assert pid is not None
-    os.kill(pid, signal.SIGSTOP)
-    desk.submit(JobKind.WALK, job)
-    desk.submit(JobKind.WALK, job)
-    ended = desk.drain(JobKind.WALK)
-    assert [bool(e.result) or e.result.reason is FailureReason.TIMEOUT for e in ended] == [True, True]
-    desk.close()
-    assert gone(pid)
 
 
 @pytest.mark.slow

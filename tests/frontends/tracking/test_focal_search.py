@@ -14,6 +14,7 @@ from dualslam.core.camera.focal import FocalSearch
 from dualslam.core.camera.models import DivisionCamera, PinholeCamera
 from dualslam.core.config.settings import FrontendConfig
 from dualslam.core.types import Failure, Features
+from dualslam.frontends.tracking import focal_search
 from dualslam.frontends.tracking.focal_search import search_focal
 from dualslam.testing.point_world import CAMERA, SIZE_PX, PointWorld, cloud, hand_held, path
 
@@ -22,6 +23,12 @@ def features_of(world: PointWorld, camera: Camera = CAMERA) -> list[Features]:
     """Return what another lens in the same place makes of the world's features."""
     seen = [world.features(i) for i in range(len(world.T_world_cam))]
     return [replace(each, uv_px=camera.project(CAMERA.unproject(each.uv_px))) for each in seen]
+
+
+@pytest.fixture(autouse=True)
+def _few_pairs(monkeypatch: pytest.MonkeyPatch) -> None:
+    """For time's sake: they tell less, but enough for these worlds."""
+    monkeypatch.setattr(focal_search, "MAX_PAIRS", 12)
 
 
 def search(features: list[Features], seed: int = 0, size_px: tuple[int, int] = SIZE_PX) -> FocalSearch | Failure:
