@@ -248,7 +248,7 @@ class FinalRefiner(Protocol):
         ...
 
 
-START_REACH = 64
+START_REACH = 192
 """Frames back from the newest that a starter looks for its first view, at most."""
 
 

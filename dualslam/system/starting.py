@@ -30,6 +30,8 @@ later one: over 1 to 1.5 s without frames (`kitti_03`, three places) the link's 
 starts of 0.20 to 0.27 degrees. It was known to 1.1 to 1.6 % up to 0.38, and to 1.7 % at best from 0.45 and more, after
 tries in vain."""
 
+REACH_IN_TIME = 64
+"""As `START_REACH` in real time, of frames whose pixels have changed: three seconds of them take 0.2 s."""
 FORESEEN = 3
 """Frames before a loss that reverse tracking over it asks for: two that cross the gap, and one to go on from there."""
 
@@ -47,17 +49,22 @@ class Starting:
         self._sightings = sightings
         self._starter = state.parts.new_starter()
         self._n_without_map = 0  # frames
+        self._is_held_back = False  # frames are, until the shutter is known
         self._since_s: float | None = None  # stamp of the first of them for which a start was looked for
         self._foresee: Callable[[View], None] | None = None  # for the first frame after a loss that shows something
 
     def begin_anew(self, lost: list[View]) -> None:
         """Look for the next map's start from these frames on."""
-        self._since_s = None
+        self._since_s, self._is_held_back = None, False
         self._collect(lost)
 
     def begin_again(self) -> None:
         """Look for the next map's start anew, as the pixels of the frames that are buffered have changed."""
-        self._begin_from(self._state.buffer.newest(START_REACH))
+        self._begin_from(self._state.buffer.newest(self._reach))
+
+    @property
+    def _reach(self) -> int:
+        return REACH_IN_TIME if self._state.pace.in_real_time else START_REACH
 
     def _begin_from(self, waiting: Iterable[View]) -> None:
         rows = self._state.record.rows
@@ -148,12 +155,15 @@ class Starting:
         with state.record.timer.measure("shutter"):
             readout_s = shutter.readout_s
             may_start = shutter.may_start(view, state.parts.calibration.camera)
-            if shutter.readout_s != readout_s:
-                view = self._correct_shutter(view)
+            tried = self._correct_shutter() if shutter.readout_s != readout_s else [view]
         if not may_start:
+            self._is_held_back = True
             return Failure(FailureReason.DOUBTFUL_INITIALISATION, "a fast turn before the shutter is known")
         with state.record.timer.measure("initialisation"):
-            start = self._starter.add(view, view.timestamp_s - self._since_s, briefly=state.pace.in_real_time)
+            for each in tried:
+                start = self._starter.add(each, each.timestamp_s - self._since_s, briefly=state.pace.in_real_time)
+                if start:
+                    break
         if isinstance(start, Failure) and start.reason is FailureReason.DOUBTFUL_INITIALISATION:
             state.record.event(EventKind.INITIALISATION_REFUSED, view, None, reason=start.detail, **start.numbers)
         if isinstance(start, Failure):
@@ -203,15 +213,22 @@ class Starting:
             self._note_refused(view, start)
         return start
 
-    def _correct_shutter(self, view: View) -> View:
-        """Take the shutter that was found out of the frames so far; the starter begins anew. Returns the view's own."""
+    def _correct_shutter(self) -> list[View]:
+        """Take the shutter that was found out of the frames so far; the starter begins anew.
+
+        Returns the frames to be tried: the newest, and before it those that no start was looked for in, as the shutter
+        was not known. In real time there is no time for these.
+        """
         state, shutter = self._state, self._state.parts.shutter
-        state.record.event(EventKind.SHUTTER_FOUND, view, None, readout_s=shutter.readout_s)
+        *_, newest = state.buffer.newest(1)
+        state.record.event(EventKind.SHUTTER_FOUND, newest, None, readout_s=shutter.readout_s)
         correct_views(state.buffer, shutter, state.parts.calibration.camera)
         state.relocaliser.end()  # it is of the pixels of before
-        *waiting, newest = state.buffer.newest(START_REACH + 1)
-        self._begin_from(waiting)
-        return newest
+        *waiting, newest = state.buffer.newest(self._reach + 1)
+        tries_again, self._is_held_back = self._is_held_back and not state.pace.in_real_time, False
+        self._begin_from([] if tries_again else waiting)
+        rows = state.record.rows
+        return [*(v for v in waiting if tries_again and rows[v.index].submap is None), newest]
 
     def begin(self, start: Start) -> Track | Failure:
         """Make a submap of a start, and pose the frames before and between by reverse tracking over the buffer."""

@@ -275,6 +275,36 @@ def test_collected_views_can_be_first_views() -> None:
     assert start.views[-1].index == 11
 
 
+ROUND = 128
+"""Frames in which the camera turns round."""
+
+
+def turned_round(step_m: float, n_points: int = 4000) -> PointWorld:
+    """A camera that turns round while it moves by a little: it sees the same again from somewhere else."""
+    xyz = 3 * cloud(3 * n_points)[:n_points] - [0, 0, 22.5]
+    T_world_cam = path(ROUND + 8, [step_m, 0, 0], [0, 2 * np.pi / ROUND, 0])
+    return PointWorld(xyz[np.linalg.norm(xyz, axis=1) > 4], T_world_cam)
+
+
+def test_what_is_seen_again_after_a_turn_starts_a_map() -> None:
+    world = turned_round(0.01)
+    starter = _fed(initialiser(), world.views()[:ROUND])
+    start = starter.add(world.view(ROUND))
+    assert isinstance(start, Start)
+    assert start.views[0].index == 0
+    T_true = world.T_world_cam[[view.index for view in start.views]]
+    translation, rotation = pose_errors(start.T_first_cam, T_true)
+    assert rotation.max() < ROTATION_RAD
+    assert translation.max() < TRANSLATION * np.linalg.norm(T_true[-1, :3, 3] - T_true[0, :3, 3])
+
+
+@pytest.mark.parametrize(("step_m", "n_points"), [(0.0, 4000), (0.01, 700)], ids=["no step", "few points"])
+def test_a_turn_alone_starts_no_map_and_neither_do_few_points(step_m: float, n_points: int) -> None:
+    world = turned_round(step_m, n_points)
+    starter = _fed(initialiser(), world.views()[:ROUND])
+    assert not any(starter.add(world.view(i)) for i in range(ROUND, ROUND + 8))
+
+
 def test_the_same_views_give_the_same_start() -> None:
     world = PointWorld(cloud(), path(20, np.array([0.1, 0, 0.02]), np.array([0, 0.004, 0])))
     (a, _), (b, _) = feed(world.views()), feed(world.views())

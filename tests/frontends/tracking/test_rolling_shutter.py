@@ -258,7 +258,11 @@ def run_over_a_turn(**camera: object) -> tuple[System, FloatArray]:
     """A rolling shutter that only turns for a hundred frames, and then moves."""
     turning, moving = shaken(N_TURNING), path(25, np.array([0.12, 0, 0]), np.array([0, 0.004, 0]))
     turning[:, :3, 3] = 0
-    world = PointWorld(cloud(), np.concatenate([turning, turning[-1] @ moving]))
+    return run_over(np.concatenate([turning, turning[-1] @ moving]), **camera)
+
+
+def run_over(T_world_cam: FloatArray, **camera: object) -> tuple[System, FloatArray]:
+    world = PointWorld(cloud(), T_world_cam)
     system = system_in(world, camera={"model_sigma_px": 0.0, **camera})
     shutter = system._state.parts.shutter
 
@@ -290,6 +294,26 @@ def test_a_turn_alone_starts_no_map() -> None:
     assert rotation.max() < 0.5 * row_shift
     taken_for_global, _ = run_over_a_turn(readout_s=0.0)
     assert first(taken_for_global, EventKind.INITIALISED).frame < N_TURNING
+
+
+@pytest.mark.slow
+def test_frames_from_before_the_shutter_was_known_start_a_map(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It is known from frame 60 on, and the camera stands from frame 40 on."""
+    T = shaken(80)
+    T[:, :3, 3] *= 6
+    T[40:] = T[40]
+
+    def may_start(shutter: RollingShutter, view: View, _: object) -> bool:
+        shutter.readout_s = READOUT_S if view.index >= 60 else 0.0
+        return view.index >= 60
+
+    monkeypatch.setattr(RollingShutter, "may_start", may_start)
+    system, T_true = run_over(T)
+    assert first(system, EventKind.INITIALISED).frame <= 40 < first(system, EventKind.SHUTTER_FOUND).frame
+    submap = system.atlas.submaps[0]
+    posed = sorted(submap.keyframes)
+    _, rotation = pose_errors(submap.keyframe_poses(posed), T_true[posed])
+    assert rotation.max() < np.radians(1)
 
 
 def test_between_two_readout_times_that_fit_alike_lies_the_mean() -> None:
