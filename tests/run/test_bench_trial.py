@@ -124,7 +124,7 @@ def test_the_command_writes_tables_and_runs_nothing_twice(done: Done, capsys: py
 def test_a_cluster_gives_the_line_that_this_machine_gives(trial: Trial, done: Done, tmp_path: Path) -> None:
     (tmp_path / "tiny.yaml").write_text(SPEC)
     out = tmp_path / "out"
-    with dask_cluster(tmp_path) as cluster:
+    with dask_cluster(tmp_path, 1) as cluster:
         command = ["bench", str(tmp_path / "tiny.yaml"), "--out", str(out), "--scheduler", cluster.address]
         assert main([*command, "--quiet"]) == 0
     (line,) = TrialLog(out / "trials.jsonl").records

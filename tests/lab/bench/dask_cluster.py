@@ -1,4 +1,4 @@
-"""A Dask scheduler and two workers, each a process of its own, on loopback."""
+"""A Dask scheduler and its workers, each a process of its own, on loopback."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ class Cluster:
 
 
 @contextmanager
-def dask_cluster(folder: Path) -> Iterator[Cluster]:
+def dask_cluster(folder: Path, n_workers: int = 2) -> Iterator[Cluster]:
     info = folder / "scheduler.json"
     processes = [start("dask_scheduler", "--host", "127.0.0.1", "--port", "0", "--scheduler-file", str(info))]
     try:
         address = address_in(info)
         workers = [
             start("dask_worker", address, "--nthreads", "1", "--no-nanny", "--local-directory", str(folder / f"{i}"))
-            for i in range(2)
+            for i in range(n_workers)
         ]
         processes += workers
         yield Cluster(address, workers)
