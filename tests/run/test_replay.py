@@ -26,6 +26,7 @@ from dualslam.testing.lossy import Lossy
 
 SOURCE = "synthetic:street,frames=46,seed=5"
 LOSS = [
+    "frontend.n_features=500",
     "recovery.workers=1",
     "recovery.attempts=[live]",
     "corruptions=[{kind: blackout, start: 22, length: 6}]",
@@ -72,7 +73,7 @@ def lossy_run(source: str, folder: Path) -> Outcome:
 def test_a_run_is_repeated_to_the_bit_and_another_source_comes_apart(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    source, run = render_to_folder(make_sequence("street", 46, 5), tmp_path / "street"), tmp_path / "run"
+    source, run = render_to_folder(make_sequence("street", 46, 5, 320, 240), tmp_path / "street"), tmp_path / "run"
     lossy_run(str(source), run)
     rows = [json.loads(line) for line in (run / "schedule.jsonl").read_text().splitlines()]
     assert {"ok", "worker"} <= {row["outcome"] for row in rows if "outcome" in row}
