@@ -7,7 +7,7 @@ Each prints a line; a file that holds some runs already is continued. Run k of a
 always. A link is wrong by the rule as it is written, drift or not. Where one is, the world is run once more without the
 failure, and that map, which never broke, is audited at the same frames: what the scale is off by there is drift, and
 not the link's doing. Beside it stands what the links are off by over the frames that both maps pose. A lost map is
-absorbed where the walk of the next one has posed all its frames anew: it is not linked, and nothing of it is missing.
+taken over where all its frames are registered in another one: it is not linked, and nothing of it is missing.
 
 Settings are chosen on the development half (world seeds from 0) and reported on the other (from 10,000).
 """
@@ -143,7 +143,7 @@ def measure(system: Any, world: Any, audits: list[Any], cpu_s: float) -> dict[st
     return {
         "failures": len(system.events.of_kind(EventKind.FAILED)),
         "restarts": len(system.events.of_kind(EventKind.REINITIALISED)),
-        "absorbed": sum(len(e.data["old_submaps"]) for e in system.events.of_kind(EventKind.ABSORBED)),
+        "taken over": sum(len(e.data["old_submaps"]) for e in system.events.of_kind(EventKind.REGISTERED)),
         "links": [a.as_dict() for a in audits if hasattr(a, "as_dict")],
         "unaudited": sum(not hasattr(a, "as_dict") for a in audits),
         "refused": [str(e.data.get("reason")) for e in system.events.of_kind(EventKind.LINK_REFUSED)],
@@ -175,7 +175,7 @@ def is_drift(link: dict[str, Any]) -> bool:
 def table(runs: list[dict[str, Any]]) -> str:
     """Return the results by kind of failure, as Markdown."""
     lines = [
-        "| scene | failure | runs | lost maps | with a new map | linked | absorbed | wrong | of these beyond drift "
+        "| scene | failure | runs | lost maps | with a new map | linked | taken over | wrong | of these beyond drift "
         "| scale % med / max | rotation deg med / max | position % med / max | live scale % med / max "
         "| over its sigma, rms | scale % where both maps are, rms / max "
         "| ATE % med | silent jumps | frames lost within 1 s of a fusion |",
@@ -188,7 +188,7 @@ def table(runs: list[dict[str, Any]]) -> str:
             continue
         links = [link for r in of for link in r["links"]]
         cells = [scene, kind, len(of), sum(r["failures"] for r in of), sum(r["restarts"] for r in of), len(links)]
-        cells.append(sum(r["absorbed"] for r in of))
+        cells.append(sum(r["taken over"] for r in of))
         cells += [sum(link["wrong"] for link in links), sum(link["wrong"] and not is_drift(link) for link in links)]
         for name, factor in (("scale", 100), ("rotation_deg", 1), ("position", 100), ("live_scale", 100)):
             values = [factor * abs(link[name]) for link in links if link[name] is not None]

@@ -38,7 +38,6 @@ class EventKind(StrEnum):
     RELINKED = "relinked"
     LINK_REFUSED = "link_refused"
     FUSED = "fused"
-    ABSORBED = "absorbed"
     CUT = "cut"
     REGISTERED = "registered"
     REGISTRATION_REFUSED = "registration_refused"

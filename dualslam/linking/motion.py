@@ -118,6 +118,29 @@ def seam_motions(old: Path, new: Path, slack: Slack = lambda i, j: 0.0) -> Itera
         yield motion
 
 
+def find_reached(path: Path, is_known: BoolArray, known: Path) -> BoolArray:
+    """Return the frames (N,) of a path to which steps that the camera can have made lead from known ones.
+
+    Steps from or to a frame that is not known are measured. The refused ones part the path: a part without a known
+    frame is not reached. The last known frames before a refused step may be corrupted, as in `seam_motions`.
+
+    - `is_known` (N,): frames whose place is known.
+    - `known`: the camera's path where the usual error is measured, in the unit of `path`.
+    """
+    fits, usual, rows = _Fits.of(path), _Fits.of(known), np.arange(len(path))
+
+    def is_torn(i: int) -> bool:
+        motion, tail = _measure(fits, i, usual), is_known & (rows <= i) & (rows > i - TAIL)
+        if motion is None or not motion.is_refused or i < TAIL or not tail.any():
+            return motion is not None and motion.is_refused
+        without = _measure(_Fits.of(path.take(~tail)), i - int(tail.sum()), usual)
+        return without is None or without.is_refused
+
+    torn = [is_torn(i) if not (is_known[i] and is_known[i + 1]) else False for i in range(len(path) - 1)]
+    part = np.concatenate([[0], np.cumsum(torn)])
+    return np.isin(part, part[is_known])
+
+
 def join_slack(S_old_new: FloatArray, covariance: FloatArray, place: FloatArray) -> float:
     """Return how far the similarity that joins two maps may displace a place, in the unit of the old map.
 

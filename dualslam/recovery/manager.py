@@ -28,7 +28,7 @@ from dualslam.map.solving import solve
 from dualslam.map.split import sound_copy
 from dualslam.map.submap import Submap
 from dualslam.map.submap_change import change_of_frame
-from dualslam.recovery.bypass import absorb, n_frames, pose_frames
+from dualslam.recovery.bypass import pose_frames
 from dualslam.recovery.frame_buffer import FrameBuffer
 from dualslam.recovery.fusion import fuse, gauge_at_overlap, note_refused, tighten
 from dualslam.recovery.job import FoundLink, RecoveryJob, RecoveryResult, path_of
@@ -88,8 +88,6 @@ class Recoveries:
         self._under_way: dict[int, _UnderWay] = {}  # by the new submap's id
         self._circumstances: dict[int, dict[str, Any]] = {}  # of the walk, by the new submap's id
         self._retries = RetrySchedule(config.retry_keyframes)
-        self._is_ending = False
-        self._outgrown_at: dict[int, int] = {}  # by the submap that has posed all frames of a lost one: how many
         self._tries = LinkTries()  # at linking lost submaps
 
     @property
@@ -153,7 +151,7 @@ class Recoveries:
             return
         due = self._retries.take_if_due(submap, now.index, self._calibration.camera, last_chance)
         loose = self._joined_loosely(submap.id)
-        if not (due or self._outgrows(submap.id, last_chance) or (loose and last_chance)):
+        if not (due or (loose and last_chance)):
             return
         lost = {k for m in self._apart_from(submap.id) for k in self._record.atlas.submaps[m].keyframes}
         own = [view for view in self._buffer if view.index in submap.keyframes]
@@ -164,17 +162,6 @@ class Recoveries:
             self._submit(submap, way[0].index, way[1:], {}, now)
         elif loose:
             self._submit(submap, first, (), {}, now)
-
-    def _outgrows(self, submap_id: int, last_chance: bool) -> bool:
-        """Whether a submap takes over the frames of a lost one, all of which a walk has posed. True only once.
-
-        It does once it holds more, or at the end of the run.
-        """
-        at = self._outgrown_at.get(submap_id)
-        outgrows = at is not None and (last_chance or n_frames(self._record, submap_id) > at)
-        if outgrows:
-            del self._outgrown_at[submap_id]
-        return outgrows
 
     def _submit(
         self,
@@ -232,7 +219,6 @@ class Recoveries:
         """
         if last is None:
             return
-        self._is_ending = True
         self._take(self._desk.drain(JobKind.WALK), live, last)
         if live is not None and not interrupted:
             solve()
@@ -398,11 +384,6 @@ class Recoveries:
                 recovery_s=result.seconds,
                 seconds=seconds,
             )
-        absorbed = absorb(self._record, recovered_frames, submap.id, self._lost.keys(), now, self._is_ending)
-        for gone in absorbed.gone:
-            self._lost.pop(gone, None)
-        if job.lost and absorbed.outgrown_at is not None:
-            self._outgrown_at[submap.id] = absorbed.outgrown_at
 
     # --- what is lost
 

@@ -14,7 +14,6 @@ import numpy as np
 
 from dualslam.core.config.settings import HealthConfig
 from dualslam.core.interfaces import Registrar
-from dualslam.core.noise_model import MAJORITY
 from dualslam.core.support import judge_track
 from dualslam.core.types import Failure, Track, View
 from dualslam.core.walk_news import REGISTRATION, WalkNews
@@ -30,6 +29,9 @@ ALIKE = 8
 """Keyframes that it resembles and is matched with."""
 MAX_SIGMA = 0.01
 """Of a position, relative to the depth of what is seen there."""
+EXPLAINED = 0.8
+"""Share of the matched landmarks that a pose must explain, as far as these are known. One relative pose explains all
+matches of two images, so few are wrong. Where more disagree, the landmarks contradict each other."""
 ADJUSTED_WITH = 8
 """Covisible keyframes that are adjusted with a new one."""
 MAX_KEYFRAMES = 1000
@@ -49,21 +51,33 @@ class Registration:
     """
 
     submap: Submap
-    views: Mapping[int, View]
+    views: dict[int, View]
     alike: Mapping[int, list[int]]
     registrar: Registrar
     adjust: Callable[[Submap, Collection[int]], None]
     health: HealthConfig
     watch: Callable[[WalkNews], None]
+    added: list[int] = field(default_factory=list)  # frames that were registered, in their order
     _tracks: dict[int, Track] = field(default_factory=dict)  # of frames that may be registered now
     _repeated: set[int] = field(default_factory=set)  # frames for which two poses stood
 
-    def run(self) -> list[int]:
-        """Register all frames that can be; return them in their order."""
-        added: list[int] = []
-        if not any(self._ask(i) for i in sorted(self.views)):
-            return added
-        self.registrar.densify()
+    def run(self) -> None:
+        """Register all frames that can be."""
+        if any(self._ask(i) for i in sorted(self.views)):
+            self.registrar.densify()
+            self._grow()
+
+    def run_without(self, frames: Collection[int]) -> None:
+        """Remove registered frames from the submap, and register others that can be."""
+        for i in set(frames) & set(self.added):
+            self.submap.remove_keyframe(i, next(k for k in self.submap.keyframes_near(i) if k != i))
+            del self.submap.anchors[i], self.views[i]
+            self.added.remove(i)
+        self._grow()
+
+    # --- steps
+
+    def _grow(self) -> None:
         due, n_adjusted = set(self.views), self._adjust_all()
         while len(self.submap.keyframes) < MAX_KEYFRAMES:
             for i in sorted(due):
@@ -72,21 +86,18 @@ class Registration:
             best = max(self._tracks, key=lambda i: (self._tracks[i].n_inliers, -i), default=None)
             if best is None:
                 if len(self.submap.keyframes) == n_adjusted:
-                    return added
+                    return
                 due, n_adjusted = set(self.views), self._adjust_all()
                 continue
             # The map has grown, or was adjusted, since the frame was posed.
             if not self._ask(best) or self._is_repeated(best):
                 continue
             self._add(best)
-            added.append(best)
-            self._report(best, len(added))
+            self.added.append(best)
+            self._report(best, len(self.added))
             due = self._beside(best)
             if len(self.submap.keyframes) >= GROWTH * n_adjusted:
                 n_adjusted = self._adjust_all()
-        return added
-
-    # --- steps
 
     def _adjust_all(self) -> int:
         """Adjust all keyframes; return how many there are."""
@@ -116,7 +127,7 @@ class Registration:
         if i in self.submap.keyframes or i in self._repeated or not keyframes:
             return False
         track = judge_track(self.registrar.pose(self.views[i], keyframes), self.health)
-        if isinstance(track, Failure) or track.n_inliers < MAJORITY * track.n_matches or not self._is_sure(track):
+        if isinstance(track, Failure) or track.n_inliers < EXPLAINED * track.n_matches or not self._is_sure(track):
             return False
         self._tracks[i] = track
         return True

@@ -35,7 +35,7 @@ class FailureStory:
     tries: list[Event]  # links to the lost map, accepted or refused
     linked: Event | None
     fused: Event | None
-    absorbed: Event | None  # where a later map had posed all its frames
+    taken_over: Event | None  # where all its frames were registered in the main map
     relocalised: Event | None  # where it was found again, before another map had started
 
     @property
@@ -71,7 +71,7 @@ def stories(run: RunData) -> list[FailureStory]:
                 tries=[e for e in own if e.get("event") in _TRIES],
                 linked=next((e for e in own if e["event"] == "linked"), None),
                 fused=next((e for e in own if e["event"] == "fused"), None),
-                absorbed=next((e for e in later if lost in e.get("old_submaps", [])), None),
+                taken_over=next((e for e in later if lost in e.get("old_submaps", [])), None),
                 relocalised=next_map if next_map.get("event") == "relocalised" else None,
             )
         )
@@ -110,8 +110,8 @@ def verdict(run: RunData, story: FailureStory) -> tuple[str, bool]:
         return "seen again", True
     if story.linked is not None:
         return "linked with the map after it", True
-    if story.absorbed is not None:
-        return "taken over by a later map", True
+    if story.taken_over is not None:
+        return "taken over by the main map", True
     if any(row.in_main_map for row in rows) and story.restart is None:
         return "no map after it", False
     return "not linked", False
@@ -166,9 +166,10 @@ def _outcome(story: FailureStory) -> str:
             if "scale" in link
             else f"The recovery linked the two{took}{after}.{bypass}"
         )
-    if story.absorbed is not None:
-        frames = count(story.absorbed["frames"], "frame")
-        return f"By reverse tracking, submap {story.absorbed['submap']} posed all its {frames}: no link is needed."
+    if story.taken_over is not None:
+        frames = count(story.taken_over["frames"], "frame")
+        submap = story.taken_over["submap"]
+        return f"All its frames are among the {frames} that were registered in submap {submap}: no link is needed."
     broken = "".join(f" A recovery failed: {e.get('detail') or e.get('reason')}." for e in story.broken)
     if not refused:
         met_few = "reverse tracking met too few keyframes of the lost map"

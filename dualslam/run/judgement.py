@@ -228,26 +228,25 @@ def _loose_joins(system: System, trajectories: Trajectories) -> list[Reason]:
 
 
 def _replaced(system: System, trajectories: Trajectories) -> list[Reason]:
-    """Find frames that a later map has taken from an earlier one whose path it contradicts: one is wrong."""
+    """Find frames that the main map has taken from another one whose path it contradicts: one is wrong."""
     centres = dict(zip(trajectories.main.index.tolist(), trajectories.main.T_world_cam[:, :3, 3], strict=True))
-    for event in system.events.of_kind(EventKind.ABSORBED):
-        for earlier in (system.atlas.submaps[m] for m in event.data["old_submaps"]):
-            index_of = {system.numbers.index_of(k): k for k in sorted(earlier.keyframes)}
-            index = [i for i in index_of if i in centres]
-            if len(index) < MIN_COMPARED:
-                continue
-            was = earlier.keyframe_poses(np.array([index_of[i] for i in index]))[:, :3, 3]
-            now = np.array([centres[i] for i in index])
-            path, aligned = float(np.linalg.norm(np.diff(now, axis=0), axis=1).sum()), umeyama(was, now)
-            noise = MIN_JUMP_DEPTHS * _median_depth(system, trajectories, index[len(index) // 2])
-            if isinstance(aligned, Failure) or aligned.rmse < max(MAX_PATH_CHANGE * path, noise):
-                continue
-            first, last = min(index), max(index)
-            text = (
-                f"Two maps of frames {first} to {last} contradict each other by {100 * aligned.rmse / path:.0f} % of "
-                "the path. The later one was kept. Compare with a run backwards (--reverse)."
-            )
-            return [Reason(ReasonCode.REPLACED, Level.USABLE, text, first, last)]
+    for earlier in (system.atlas.submaps[m] for m in system.atlas.submaps if m not in trajectories.main_submaps):
+        index_of = {system.numbers.index_of(k): k for k in sorted(earlier.keyframes.keys() - earlier.condemned)}
+        index = [i for i in index_of if i in centres]
+        if len(index) < MIN_COMPARED:
+            continue
+        was = earlier.keyframe_poses(np.array([index_of[i] for i in index]))[:, :3, 3]
+        now = np.array([centres[i] for i in index])
+        path, aligned = float(np.linalg.norm(np.diff(now, axis=0), axis=1).sum()), umeyama(was, now)
+        noise = MIN_JUMP_DEPTHS * _median_depth(system, trajectories, index[len(index) // 2])
+        if isinstance(aligned, Failure) or aligned.rmse < max(MAX_PATH_CHANGE * path, noise):
+            continue
+        first, last = min(index), max(index)
+        text = (
+            f"Two maps of frames {first} to {last} contradict each other by {100 * aligned.rmse / path:.0f} % of "
+            "the path. The larger one was kept. Compare with a run backwards (--reverse)."
+        )
+        return [Reason(ReasonCode.REPLACED, Level.USABLE, text, first, last)]
     return []
 
 

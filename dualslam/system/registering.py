@@ -14,10 +14,9 @@ from dualslam.atlas.record import FrameStamp
 from dualslam.atlas.trajectory import FramePose, Path
 from dualslam.core.errors import SolverError
 from dualslam.core.events import EventKind
-from dualslam.core.noise_model import PROOF_VIEWS
+from dualslam.core.noise_model import MAX_TRIES, PROOF_VIEWS
 from dualslam.core.types import FailureReason, FrameMethod, FrameStatus, View
-from dualslam.linking.join_test import judge_motion
-from dualslam.linking.motion import seam_motions
+from dualslam.linking.motion import find_reached
 from dualslam.map.frame_observations import FrameObservations
 from dualslam.map.submap import Submap
 from dualslam.recovery.frame_buffer import MB
@@ -113,26 +112,34 @@ class Registering:
         record, parts = self._state.record, self._state.parts
         grown = submap.copy()
         registrar, health = parts.new_registrar(grown), self._state.config.health
-        registration = Registration(grown, views, alike, registrar, parts.adjust, health, parts.walk_watch)
+        registration = Registration(grown, dict(views), alike, registrar, parts.adjust, health, parts.walk_watch)
+        left_out = set[int]()
         try:
-            added = registration.run()
+            registration.run()
+            for _ in range(MAX_TRIES):
+                added = self._found(registration, views.keys() - left_out)
+                if not (refused := self._unreached(submap, grown, added)):
+                    break
+                left_out |= refused
+                registration.run_without(refused)
         except SolverError as error:
             log.warning("no frame is registered in submap %d: %s", submap.id, error)
             return
-        if not added:
+        data = {"frames": len(added), "asked": len(views), "left_out": len(left_out)}
+        if refused or not added:
+            if left_out:
+                record.event(EventKind.REGISTRATION_REFUSED, now, submap.id, **data)
             return
-        added += [i for i in views if self._shows_enough(grown, i) and i not in added]
         before = submap.copy()
-        old, new = self._paths(submap, grown, added)
-        refused = judge_motion(seam_motions(old, new)).refusal()
-        data = {"frames": len(added), "asked": len(views)}
-        if refused is not None:
-            record.event(EventKind.REGISTRATION_REFUSED, now, submap.id, detail=refused.detail, **data)
-            return
         submap.take_over(grown)
         self._connections.carry(before, submap)
+        held = self._with_frames()
         self._enter(submap, added)
-        record.event(EventKind.REGISTERED, now, submap.id, **data)
+        record.event(EventKind.REGISTERED, now, submap.id, old_submaps=sorted(held - self._with_frames()), **data)
+
+    def _with_frames(self) -> set[int]:
+        """Return the submaps that have frames."""
+        return {pose.submap_id for pose in self._state.record.own_poses()}
 
     def _shows_enough(self, submap: Submap, i: int) -> bool:
         """Whether a frame is a keyframe that reverse tracking left in a submap, and is posed there as well."""
@@ -141,12 +148,21 @@ class Registering:
         n_proven = np.count_nonzero(submap.n_observations(submap.seen_in(i)) >= PROOF_VIEWS)
         return bool(n_proven >= self._state.config.health.min_inliers)
 
-    def _paths(self, before: Submap, grown: Submap, added: list[int]) -> tuple[Path, Path]:
-        """Return the camera's path in a submap as it was, and that of the frames registered since."""
-        old = Path.of((p for p in self._state.record.own_poses() if p.submap_id == before.id), before)
+    def _found(self, registration: Registration, frames: Iterable[int]) -> list[int]:
+        """Return the frames that are registered, and those that reverse tracking has posed in the submap before."""
+        registered, submap = set(registration.added), registration.submap
+        return [i for i in sorted(frames) if i in registered or self._shows_enough(submap, i)]
+
+    def _unreached(self, before: Submap, grown: Submap, added: list[int]) -> set[int]:
+        """Return the registered frames to which no steps of the camera lead from the submap's own."""
+        if not added:
+            return set()
+        own = [p for p in self._state.record.own_poses() if p.submap_id == before.id and p.index not in added]
         poses = [FramePose(k, grown.keyframes[k].timestamp_s, grown.id, k, np.eye(4)) for k in added]
-        taken = set(added)
-        return old.take(np.array([i not in taken for i in old.index.tolist()], bool)), Path.of(poses, grown)
+        path = Path.of([*own, *poses], grown)
+        known = ~np.isin(path.index, added)
+        reached = find_reached(path, known, path.take(known))
+        return set(path.index[~reached].tolist())
 
     def _enter(self, submap: Submap, added: list[int]) -> None:
         """Enter the poses of registered frames, and of the frames that hang on them in another submap."""

@@ -136,7 +136,7 @@ class System:
     @property
     def _registers(self) -> bool:
         """Whether frames outside the main map are registered at the end of the run."""
-        return self._state.config.recovery.enabled and self.saved is None and not self.pace.in_real_time
+        return self._state.config.recovery.enabled and self.saved is None
 
     @property
     def desk(self) -> ScheduledDesk:

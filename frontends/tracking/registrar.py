@@ -7,15 +7,20 @@ from collections.abc import Collection
 import numpy as np
 
 from dualslam.core.camera.base import Camera
+from dualslam.core.chi_square import CHI2_99, squared_distances
 from dualslam.core.config.settings import Config
 from dualslam.core.firsts import is_first
 from dualslam.core.geometry import se3
+from dualslam.core.geometry.projection import project_points, projection_jacobians
+from dualslam.core.geometry.two_view import fundamental_from_pose, sampson_error
 from dualslam.core.interfaces import Frontend
 from dualslam.core.noise_model import MIN_CONSENSUS, PROOF_VIEWS
-from dualslam.core.types import Failure, FailureReason, Features, IntArray, Keyframe, Track, View
+from dualslam.core.types import BoolArray, Failure, FailureReason, Features, FloatArray, IntArray, Keyframe, Track, View
 from dualslam.frontends.gap.second_pose import refuse_second_pose
 from dualslam.frontends.tracking.mapper import Mapper
 from dualslam.frontends.tracking.resection import estimate_pose
+from dualslam.frontends.tracking.two_view_hypotheses import estimate_relative_pose
+from dualslam.map.landmark_views import landmark_covariances
 from dualslam.map.submap import NO_LANDMARK, Submap
 
 BEFORE = 4
@@ -66,6 +71,8 @@ class Registrar:
         )
         if isinstance(estimate, Failure):
             return estimate
+        unsure = ~estimate.inliers
+        unsure[unsure] = self._may_be_seen_at(landmark[unsure], features.take(feature[unsure]), estimate.T_cam_w)
         landmark_ids = np.full(len(features), NO_LANDMARK, np.int64)
         landmark_ids[feature[estimate.inliers]] = landmark[estimate.inliers]
         return Track(
@@ -74,7 +81,7 @@ class Registrar:
             estimate.T_cam_w,
             landmark_ids,
             np.zeros(0, np.int64),
-            len(pair),
+            len(pair) - int(np.count_nonzero(unsure)),
             estimate.n_inliers,
             float(estimate.chi2[estimate.inliers].mean() / 2),
             True,
@@ -108,8 +115,32 @@ class Registrar:
         seen = (landmark != NO_LANDMARK) & (self._submap.n_observations(landmark) >= PROOF_VIEWS)
         return np.column_stack((in_view[seen], landmark[seen]))
 
+    def _may_be_seen_at(self, landmark_ids: IntArray, features: Features, T_cam_submap: FloatArray) -> BoolArray:
+        """Return which landmarks (N,) are too uncertain to contradict a pose that shows them beside these features."""
+        submap = self._submap
+        covariances = landmark_covariances(submap, landmark_ids)
+        xyz = submap.landmarks["xyz_mu"][landmark_ids]
+        uv, depth = project_points(submap.K, T_cam_submap, xyz)
+        J = projection_jacobians(submap.K, T_cam_submap, xyz)[1]
+        spread = J @ covariances @ J.transpose(0, 2, 1) + features.sigma_px[:, None, None] ** 2 * np.eye(2)
+        known = np.isfinite(spread).all((1, 2)) & (depth > 0)
+        off2 = np.zeros(len(landmark_ids))
+        off2[known] = squared_distances((uv - features.uv_rect_px)[known], spread[known])
+        return np.asarray(known & (off2 < CHI2_99[2]))
+
     def _matched(self, keyframe_id: int, features: Features, view: View) -> IntArray:
+        """Return (N, 2) features of a keyframe and a frame that match, if one relative pose explains them."""
         key = keyframe_id, view.index
         if key not in self._matches:
-            self._matches[key] = self._frontend.match_wide(features, view.features).index
+            pairs = self._frontend.match_wide(features, view.features).index
+            if len(pairs) >= MIN_CONSENSUS:
+                pairs = pairs[self._explained(features.take(pairs[:, 0]), view.features.take(pairs[:, 1]))]
+            self._matches[key] = pairs if len(pairs) >= MIN_CONSENSUS else pairs[:0]
         return self._matches[key]
+
+    def _explained(self, a: Features, b: Features) -> BoolArray:
+        """Return which matched features (N,) lie on each other's epipolar lines under the pose that most agree with."""
+        pixels, sigma = (a.uv_rect_px, b.uv_rect_px), np.maximum(a.sigma_px, b.sigma_px)
+        K, seed = self._submap.K, self._config.seed
+        T_b_a = estimate_relative_pose(*pixels, sigma, K, self._camera.size_px, seed)
+        return np.asarray(sampson_error(fundamental_from_pose(K, T_b_a), *pixels) < CHI2_99[1] * sigma**2)

@@ -14,9 +14,11 @@ from dualslam.core.types import Failure, FailureReason, FloatArray
 from dualslam.linking.join_test import judge_motion
 from dualslam.linking.motion import (
     MIN_ASKED,
+    TAIL,
     WINDOW_FRAMES,
     Motion,
     Slack,
+    find_reached,
     gaps_of,
     join_slack,
     measure_motion,
@@ -238,6 +240,30 @@ def test_a_seam_behind_a_corrupted_tail_is_believed() -> None:
     old, new = whole.take(np.arange(200) < 100), whole.take(np.arange(200) >= 100)
     assert refuse_seams(old, new) is None
     assert refuse_seams(old.take(np.arange(100) < 95), replace(new, T_map_cam=new.T_map_cam + 1.0)) is not None
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_frames_are_reached_by_steps_that_the_camera_makes(seed: int) -> None:
+    """Frames that are not known lie between, behind and among known ones; ten of them are where they are not."""
+    t, p = way(160, seed)
+    is_known = np.zeros(160, bool)
+    is_known[[*range(60), *range(80, 100)]] = True
+    known = path_of(t, p).take(is_known)
+    assert find_reached(path_of(t, p), is_known, known).all()
+    wrong = np.arange(120, 130)
+    p[wrong] += [0.0, 1.5, 0.0]
+    reached = find_reached(path_of(t, p), is_known, known)
+    assert not reached[wrong].any(), "they follow on known frames by a jump"
+    assert reached[:118].all()
+    assert not reached[132:].any(), "nor what only they lead to"
+
+
+def test_known_frames_before_a_torn_step_may_be_corrupted_themselves() -> None:
+    t, p = way(120, 3)
+    is_known = np.arange(120) < 80
+    p[80 - TAIL : 80] += [0.0, 0.0, 1.0]
+    path = path_of(t, p)
+    assert find_reached(path, is_known, path.take(np.arange(120) < 80 - TAIL)).all()
 
 
 def test_what_a_join_leaves_open_is_that_of_its_similarity_at_the_place() -> None:

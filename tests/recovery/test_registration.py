@@ -50,7 +50,9 @@ def registered(world: PointWorld, submap: Submap, frames: Iterable[int]) -> list
     views = {i: world.view(i) for i in frames}
     alike = {i: [k for k in (*submap.keyframes, *views) if k != i] for i in views}
     registrar = Registrar(frontend, config, submap, CAMERA)
-    return Registration(submap, views, alike, registrar, adjust, config.health, WalkWatch()).run()
+    registration = Registration(submap, views, alike, registrar, adjust, config.health, WalkWatch())
+    registration.run()
+    return registration.added
 
 
 def turn_about(n: int, step_rad: float, step_m: FloatArray, n_walked: int) -> FloatArray:

@@ -209,11 +209,11 @@ def test_colour_frames_are_kept_in_their_colours() -> None:
     assert blue < 15
 
 
-def test_a_map_that_a_later_one_took_over_is_told_without_a_link(broken_run: RunData) -> None:
-    event = {"event": "absorbed", "frame": 39, "timestamp_s": 3.9, "submap": 1, "old_submaps": [0], "frames": 20}
+def test_a_map_that_the_main_one_took_over_is_told_without_a_link(broken_run: RunData) -> None:
+    event = {"event": "registered", "frame": 39, "timestamp_s": 3.9, "submap": 1, "old_submaps": [0], "frames": 20}
     text = outline(with_events(broken_run, event)).text
-    assert "✓ taken over by a later map" in text
-    assert "submap 1 posed all its 20 frames: no link is needed." in text
+    assert "✓ taken over by the main map" in text
+    assert "All its frames are among the 20 frames that were registered in submap 1: no link is needed." in text
     assert "The two maps are not joined" not in text
 
 

@@ -135,7 +135,6 @@ def test_a_map_that_contradicts_the_one_it_was_replaced_by_makes_a_run_usable(be
         T[:3, 3] *= 0.4 * (bend if i > 70 else 1.0)
         earlier.add_keyframe(Keyframe(i, i / 30, NO_FEATURES), T)
     system.atlas.add(earlier)
-    system.events.add(EventKind.ABSORBED, 150, 5.0, 0, old_submaps=[1], frames=20)
     verdict = judged(system)
     assert verdict.level is level
     about = [(reason.code, reason.first_frame, reason.last_frame) for reason in verdict.reasons]
