@@ -44,6 +44,16 @@ def test_frames_without_a_pose_are_found_at_the_end(world: PointWorld) -> None:
     assert not COVERED & set(main.index.tolist())
 
 
+def test_in_real_time_they_are_found_too(world: PointWorld) -> None:
+    system = system_in(world, recovery={"enabled": True})
+    for frame in world.frames():
+        system.pace.note(0.0)
+        system.step(frame)
+    system.finish()
+    (event,) = system.events.of_kind(EventKind.REGISTERED)
+    assert event.data["frames"] == len(RETURN)
+
+
 def test_without_recovery_they_stay_without(world: PointWorld) -> None:
     system = ended(world, recovers=False)
     assert not system.events.of_kind(EventKind.REGISTERED)
