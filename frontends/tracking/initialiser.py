@@ -1,4 +1,4 @@
-"""How a submap starts: two views with parallax, a first bundle adjustment, and a check that refuses doubtful starts.
+"""How a submap starts: two views with parallax, whose pose the frames between them prove (`start_proof.py`).
 
 A wrong start costs more than a late one. It must pass three tests:
 
@@ -9,41 +9,25 @@ A wrong start costs more than a late one. It must pass three tests:
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import combinations, cycle
 
 import numpy as np
 
-from dualslam.core.bundle import BundleAdjuster, BundleProblem
-from dualslam.core.chi_square import CHI2_95, CHI2_99, MEDIAN_CHI2
+from dualslam.core.bundle import BundleAdjuster
+from dualslam.core.chi_square import CHI2_95
 from dualslam.core.config.settings import InitialiserConfig
 from dualslam.core.decisions import Gate
-from dualslam.core.errors import SolverError
 from dualslam.core.geometry import se3
-from dualslam.core.geometry.projection import refine_pose
 from dualslam.core.geometry.triangulation import triangulate_two_view
 from dualslam.core.interfaces import START_REACH, Frontend
-from dualslam.core.noise_model import GATE_SIGMAS, MIN_CONSENSUS, PROOF_VIEWS
-from dualslam.core.support import MAX_CHI2
-from dualslam.core.types import (
-    BoolArray,
-    Failure,
-    FailureReason,
-    Features,
-    FloatArray,
-    IntArray,
-    Matches,
-    Start,
-    View,
-)
+from dualslam.core.noise_model import GATE_SIGMAS, PROOF_VIEWS
+from dualslam.core.types import Failure, FailureReason, Features, FloatArray, Matches, Start, View
 from dualslam.frontends.features.motion_statistics import match_by_motion, nearest_search
 from dualslam.frontends.tracking.direction import direction_angle_deg, direction_sigma_deg
-from dualslam.frontends.tracking.near_points import nearer_than_proven, stands_before
-from dualslam.frontends.tracking.resection import MIN_SAMPLE, resect
-from dualslam.frontends.tracking.two_view_hypotheses import MIN_NOISE2, RelativePoses
+from dualslam.frontends.tracking.start_proof import MIN_POINTS, StartProof, ViewPair
+from dualslam.frontends.tracking.two_view_hypotheses import RelativePoses
 
-MIN_POINTS = 50
-"""Triangulated points that must survive the first bundle adjustment."""
 MIN_MATCHES = round(1.2 * MIN_POINTS)
 """Matches between the two views below which no model is tried: a sixth of them may be wrong."""
 MIN_PARALLAX_DEG = 1.0
@@ -52,8 +36,6 @@ However many more are far away: on a road most are, and the near ones fix the mo
 MAX_DIRECTION_SIGMA_DEG = 1.5
 """Largest standard deviation (from the bundle adjustment's Hessian) of the direction of translation: by the pixels'
 sigmas, or less in proportion, down to two thirds, where residuals are smaller than 0.3 of these."""
-MIN_SUPPORT = 0.6
-"""Share of the points that the frames between the two views must confirm by their own pixels."""
 PATIENCE_S, MAX_LENIENCE = 10.0, 4 / 3
 """Seconds without a start after which its direction may be known less well, and how many times less at most: no map
 costs more then. For a camera that hardly leaves its place for 24 s (`tum_fr1_rpy`) the best pairs know it to 1.3 to 1.9
@@ -64,37 +46,11 @@ LATE_LAGS = (96, 128, 160, START_REACH)
 """Frames back that are tried, too, once there are so many. A camera that turns to and fro sees the same again from
 somewhere else: with 3 to 7 degrees of parallax on `tum_fr1_rpy`, where nearer pairs have 1 to 2."""
 MAX_PAIRS = 2  # tried with each view, in turn: what two views farther apart lack, the next two lack most often as well
-PROVEN = 1 / 3  # share of the points that are proven, at least: a start is made of these alone
 NEAR = 0.5  # share of the points that a start needs at least which must be near: on a road these fix the motion
 RUNNER_UP = 0.75  # a pose that explains less than this share of what the best one does is out of the question,
 UNEXPLAINED_TIMES, UNEXPLAINED_MORE = 2, 20  # and so is one that leaves more than twice as many, and a layer's worth
 SAME_DEG = 10.0  # directions of translation that far apart are two answers
 DIRECTION_MARGIN = 2.0  # a bundle adjustment makes a direction's sigma 0.5 to 1.7 times what it was (70 pairs)
-USUAL_NOISE2 = 0.09  # variance of the residuals of starts that turn (`tum_fr1_rpy`: 0.05 to 0.12), of their sigmas'
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Pair:
-    """Two views, their matches, and one pose with the points that it gives."""
-
-    a: View
-    b: View
-    matches: Matches
-    T_b_a: FloatArray
-    xyz: FloatArray
-    good: BoolArray
-    n_explained: int  # matches that fit the pose, wherever their points are: at infinity, too
-    parallax_deg: float  # median
-    n_near: int  # points with at least the parallax that is asked for
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Witness:
-    """A view between the two: its pose, its feature of each point (or -1), the share of its matches that agree."""
-
-    T_first_cam: FloatArray
-    feature: IntArray
-    support: float
 
 
 class Initialiser:
@@ -112,11 +68,11 @@ class Initialiser:
         self._frontend = frontend
         if config.matching == "gms":
             nearest_search(frontend)  # a front end without it is refused before the first frame
-        self._adjuster = adjuster
         self._config = config
         self._K = K
         self._size_px = size_px
         self._seed = seed
+        self._proof = StartProof(frontend, adjuster, K, size_px, seed)
         self._views: list[View] = []
         self._turn = self._top = len(LAGS) - 1  # of `LAGS`: the next, and the one that the turn began with
         self._late = cycle(LATE_LAGS)
@@ -175,7 +131,11 @@ class Initialiser:
             detail = f"{len(matches)} matches, {MIN_MATCHES} needed"
             return Failure(FailureReason.TOO_FEW_MATCHES, detail, gates=(gate,))
         pair = self._best_pose(a, b, matches)
-        start = self._verify(pair, [a, *self._witnesses(pair, first, last), b]) if isinstance(pair, _Pair) else pair
+        start = (
+            self._proof.verify(pair, [a, *self._witnesses(pair, first, last), b])
+            if isinstance(pair, ViewPair)
+            else pair
+        )
         if isinstance(start, Start):
             direction = start.numbers["direction_sigma_deg"]
             most_deg = lenience * MAX_DIRECTION_SIGMA_DEG
@@ -195,7 +155,7 @@ class Initialiser:
             return match_by_motion(self._frontend, a, b)
         return self._frontend.match_wide(a, b)
 
-    def _best_pose(self, a: View, b: View, matches: Matches) -> _Pair | Failure:
+    def _best_pose(self, a: View, b: View, matches: Matches) -> ViewPair | Failure:
         fa, fb = matches.index[:, 0], matches.index[:, 1]
         uv_a, uv_b = a.features.uv_rect_px[fa], b.features.uv_rect_px[fb]
         sigma = np.maximum(a.features.sigma_px[fa], b.features.sigma_px[fb])
@@ -230,7 +190,7 @@ class Initialiser:
             return _direction_unknown(direction, DIRECTION_MARGIN * MAX_DIRECTION_SIGMA_DEG, numbers)
         return best
 
-    def _hopeless(self, pairs: list[_Pair], n_matches: int) -> Failure | None:
+    def _hopeless(self, pairs: list[ViewPair], n_matches: int) -> Failure | None:
         """Return why no start comes of two views, whatever else explains them; None where that is open.
 
         Most pairs of a camera that turns on the spot end here, before what is dear about a pair. Poses that explain so
@@ -248,12 +208,12 @@ class Initialiser:
                 return _direction_unknown(direction, loosest_deg, {})
         return None
 
-    def _direction_sigma_deg(self, pair: _Pair) -> float:
+    def _direction_sigma_deg(self, pair: ViewPair) -> float:
         """Return how well two views alone know the direction, before any bundle adjustment."""
         sigma_px = pair.b.features.sigma_px[pair.matches.index[pair.good, 1]]
         return direction_sigma_deg(self._K, np.eye(4), se3.inverse(pair.T_b_a), pair.xyz[pair.good], sigma_px)
 
-    def _evaluate(self, a: View, b: View, matches: Matches, T_b_a: FloatArray) -> _Pair:
+    def _evaluate(self, a: View, b: View, matches: Matches, T_b_a: FloatArray) -> ViewPair:
         fa, fb = matches.index[:, 0], matches.index[:, 1]
         points = triangulate_two_view(
             a.features.uv_rect_px[fa], b.features.uv_rect_px[fb], self._K, np.eye(4), se3.inverse(T_b_a)
@@ -270,11 +230,11 @@ class Initialiser:
         good[good] = angle > 0.5 * MIN_PARALLAX_DEG
         parallax = float(np.median(angle)) if len(angle) else 0.0
         n_near = int((angle >= MIN_PARALLAX_DEG).sum())
-        return _Pair(a, b, matches, T_b_a, points.xyz, good, n_explained, parallax, n_near)
+        return ViewPair(a, b, matches, T_b_a, points.xyz, good, n_explained, parallax, n_near)
 
-    # --- witnesses and bundle adjustment
+    # --- witnesses
 
-    def _witnesses(self, pair: _Pair, first: int, last: int) -> list[View]:
+    def _witnesses(self, pair: ViewPair, first: int, last: int) -> list[View]:
         """Views spread evenly between the two; between two far apart, among those that see their points."""
         seeing = np.arange(first, last + 1)
         if last - first > LAGS[-1]:
@@ -288,137 +248,6 @@ class Initialiser:
 
     def _sees(self, view: View, points: Features) -> bool:
         return len(self._frontend.match_wide(points, view.features)) >= MIN_POINTS // 2
-
-    def _verify(self, pair: _Pair, views: list[View]) -> Start | Failure:
-        good = np.flatnonzero(pair.good)
-        xyz = pair.xyz[good]
-        feature = np.full((len(views), len(good)), -1, np.int64)
-        feature[0], feature[-1] = pair.matches.index[good, 0], pair.matches.index[good, 1]
-        T_first_cam = np.tile(np.eye(4), (len(views), 1, 1))
-        T_first_cam[-1] = se3.inverse(pair.T_b_a)
-        support = []
-        for v in range(1, len(views) - 1):
-            witness = self._confirm(views[v], pair.a, feature[0], xyz)
-            if isinstance(witness, Failure):
-                support.append(0.0)
-                continue
-            T_first_cam[v], feature[v] = witness.T_first_cam, witness.feature
-            support.append(witness.support)
-        keep_views = (feature >= 0).any(axis=1)
-        numbers = {
-            "n_points": float(len(good)),
-            "parallax_deg": pair.parallax_deg,
-            "support": float(min(support)) if support else 0.0,
-        }
-        if not support or min(support) < MIN_SUPPORT:
-            detail = f"the frames between confirm {numbers['support']:.0%} of the points"
-            gate = Gate("share of points that the frames between confirm", numbers["support"], ">=", MIN_SUPPORT)
-            return Failure(FailureReason.DOUBTFUL_INITIALISATION, detail, numbers, gates=(gate,))
-        views = [views[v] for v in np.flatnonzero(keep_views)]
-        return self._adjust(views, T_first_cam[keep_views], xyz, feature[keep_views], numbers)
-
-    def _confirm(self, witness: View, first: View, feature: IntArray, xyz: FloatArray) -> _Witness | Failure:
-        """Pose a witness from the points alone, without a guess, and count how many of its matches agree.
-
-        Two views do not prove a few that stand far before all others: where they are enough to fix a pose, they have no
-        say in the one that is to prove them. Of what repeats itself they are copies, and would turn the witness until
-        it agreed with them.
-        """
-        matches = self._frontend.match_wide(first.features.take(feature), witness.features)
-        if len(matches) < MIN_POINTS // 2:
-            return Failure(FailureReason.TOO_FEW_MATCHES, f"{len(matches)} of {len(xyz)} points found")
-        point, seen = matches.index[:, 0], matches.index[:, 1]
-        uv_px, sigma_px = witness.features.uv_rect_px[seen], witness.features.sigma_px[seen]
-        leads = ~stands_before(xyz[point, 2], xyz[:, 2])
-        if np.count_nonzero(~leads) < MIN_SAMPLE:
-            leads[:] = True
-        sigma = float(np.median(sigma_px))
-        start = resect(self._K, self._size_px, uv_px[leads], xyz[point[leads]], sigma, self._seed)
-        estimate = refine_pose(self._K, start.T_cam_w, xyz[point], uv_px, sigma_px, counted=leads)
-        if isinstance(estimate, Failure):
-            return estimate
-        features = np.full(len(xyz), -1, np.int64)
-        features[point[estimate.inliers]] = seen[estimate.inliers]
-        return _Witness(se3.inverse(estimate.T_cam_w), features, estimate.n_inliers / len(matches))
-
-    def _adjust(
-        self, views: list[View], T_first_cam: FloatArray, xyz: FloatArray, feature: IntArray, numbers: dict[str, float]
-    ) -> Start | Failure:
-        view_of, point_of = np.nonzero(feature >= 0)
-        seen = [view.features.take(rows[rows >= 0]) for view, rows in zip(views, feature, strict=True)]
-        uv = np.concatenate([features.uv_rect_px for features in seen])
-        sigma = np.concatenate([features.sigma_px for features in seen])
-        fixed = np.zeros(len(views), bool)
-        fixed[0] = True
-        problem = BundleProblem(self._K, T_first_cam, fixed, xyz, view_of, point_of, uv, sigma)
-        try:
-            result = self._adjuster(problem)
-        except SolverError as error:
-            return Failure(FailureReason.SOLVER, str(error), numbers)
-        inlier = result.chi2 < CHI2_95[2]
-        rows = _seen_by_both(problem, inlier)
-        T_first, T_last = result.T_submap_kf[[0, -1]]
-        chi2 = float(np.median(result.chi2)) / MEDIAN_CHI2[2]
-        sigma_px = problem.sigma_px[rows] * _calmer(chi2)
-        direction = direction_sigma_deg(self._K, T_first, T_last, result.xyz_mu[problem.point[rows]], sigma_px)
-        numbers = {**numbers, "chi2": chi2, "direction_sigma_deg": direction}
-        in_front = np.all(se3.act(se3.inverse(result.T_submap_kf), result.xyz_mu)[..., 2] > 0, axis=0)
-        keep = _agreeing(problem, inlier) & in_front & result.adjusted
-        numbers["n_points"] = float(keep.sum())
-        survivors = Gate("points after adjustment", int(keep.sum()), ">=", MIN_POINTS)
-        share = Gate("share of points after adjustment", float(keep.mean()), ">=", MIN_SUPPORT)
-        if not (survivors.passed and share.passed):
-            detail = f"{keep.sum()} of {len(xyz)} points survive adjustment"
-            return Failure(FailureReason.DOUBTFUL_INITIALISATION, detail, numbers, gates=(survivors, share))
-        # What repeats itself along the epipolar line fits two views always, and a third, by chance, where pixels are
-        # less noisy than supposed: as a point right before the camera, which pins it. So a point is taken on the word
-        # of three views, by a gate in the residuals' own variance.
-        inlier &= result.chi2 < CHI2_99[2] * float(np.clip(chi2, MIN_NOISE2, 1.0))
-        n_views = np.bincount(problem.point[inlier], minlength=len(xyz))
-        proven = keep & _agreeing(problem, inlier) & (n_views >= PROOF_VIEWS)
-        # Of a pattern that repeats itself, a third view of five fits by chance. Right before the camera a point weighs
-        # most. There all views must have seen it, unless others that all have seen are as near.
-        proven &= ~nearer_than_proven(result.xyz_mu[:, 2], proven & (n_views == len(views)))
-        numbers["n_proven"] = float(proven.sum())
-        least = float(max(PROVEN * keep.sum(), MIN_CONSENSUS))
-        enough = Gate("points that three views prove", int(proven.sum()), ">=", least)
-        fits = Gate("chi-square per degree of freedom", chi2, "<", MAX_CHI2)
-        if not enough.passed:
-            detail = f"three views prove {proven.sum()} of {keep.sum()} points"
-            return Failure(FailureReason.DOUBTFUL_INITIALISATION, detail, numbers, gates=(survivors, share, enough))
-        if not fits.passed:
-            detail = f"chi-square per degree of freedom {chi2:.1f}"
-            return Failure(FailureReason.CHI_SQUARE, detail, numbers, gates=(survivors, share, enough, fits))
-        feature = feature.copy()
-        feature[view_of[~inlier], point_of[~inlier]] = -1
-        depth = float(np.median(result.xyz_mu[proven, 2]))
-        T = result.T_submap_kf.copy()
-        T[:, :3, 3] /= depth
-        return Start(views, T, result.xyz_mu[proven] / depth, feature[:, proven], numbers)
-
-
-def _agreeing(problem: BundleProblem, inlier: BoolArray) -> BoolArray:
-    """Return which points agree with both ends, and miss at most one witness."""
-    n, last = len(problem.xyz_mu), len(problem.T_submap_kf) - 1
-    agrees = np.bincount(problem.point[~inlier], minlength=n) <= 1
-    agrees[problem.point[~inlier & ((problem.kf == 0) | (problem.kf == last))]] = False
-    return agrees
-
-
-def _seen_by_both(problem: BundleProblem, inlier: BoolArray) -> IntArray:
-    """Return the last view's observations of points that the first sees, too."""
-    in_first = np.zeros(len(problem.xyz_mu), bool)
-    in_first[problem.point[(problem.kf == 0) & inlier]] = True
-    last = len(problem.T_submap_kf) - 1
-    return np.flatnonzero((problem.kf == last) & inlier & in_first[problem.point])
-
-
-def _calmer(noise2: float) -> float:
-    """Return how noisy pixels are, of those by which the bound of the direction's sigma was found; no less than drawn.
-
-    A motion is known so much better. Of a camera that leaves a bench, no two views but its first know their direction.
-    """
-    return float(np.sqrt(np.clip(noise2, MIN_NOISE2, USUAL_NOISE2) / USUAL_NOISE2))
 
 
 def _direction_unknown(direction_sigma_deg: float, most_deg: float, numbers: dict[str, float]) -> Failure:
@@ -441,7 +270,7 @@ def _few_are_chance(start: Start) -> Start | Failure:
     return Failure(FailureReason.DOUBTFUL_INITIALISATION, detail, start.numbers, gates=(proven,))
 
 
-def _contenders(pairs: list[_Pair], n_matches: int, most: int) -> list[_Pair]:
+def _contenders(pairs: list[ViewPair], n_matches: int, most: int) -> list[ViewPair]:
     """Return the pairs whose pose explains nearly as many matches as the one that explains `most`.
 
     Points without parallax are no points of a map, and yet they speak for a pose: beside a near plane, the pose that
