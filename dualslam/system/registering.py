@@ -52,7 +52,7 @@ class Registering:
         if not record.poses or self._has_repeated():
             return
         count = Counter(pose.submap_id for pose in record.own_poses())
-        main = atlas.largest(count)
+        main = atlas.largest(count + self._shown_under_a_better_camera())
         with record.timer.measure("registration"):
             views = self._outside(main)
             if not views:
@@ -75,6 +75,20 @@ class Registering:
         """
         refused = self._state.record.events.of_kind(EventKind.FAILED, EventKind.LINK_REFUSED, EventKind.LOOP_REFUSED)
         return any(event.data.get("reason") in REPEATS for event in refused)
+
+    def _shown_under_a_better_camera(self) -> Counter[int]:
+        """Return of how many frames of lost maps each submap shows keyframes, where it found the camera for these.
+
+        The lost maps are bent: they were tracked under another camera. So their frames are due to the later map.
+        """
+        record, shown = self._state.record, Counter[int]()
+        for event in record.events.of_kind(EventKind.CALIBRATED):
+            assert event.submap is not None
+            submap = record.atlas.submaps[event.submap]
+            apart = set(event.data["lost"]) - set(record.atlas.component_of(submap.id))
+            on = Counter(pose.keyframe_id for pose in record.own_poses() if pose.submap_id in apart)
+            shown[submap.id] += sum(n for k, n in on.items() if self._shows_enough(submap, k))
+        return shown
 
     def _outside(self, main: list[int]) -> dict[int, View]:
         """Return the frames outside the main map: those without a pose, and the keyframes of other submaps."""

@@ -39,3 +39,16 @@ def test_the_smaller_map_gives_its_frames_to_the_larger_one(n_frames: int, buffe
     translation, rotation = pose_errors(main.T_world_cam, world.T_world_cam[main.index])
     assert translation.max() < POSITION_M
     assert rotation.max() < ROTATION_RAD
+
+
+@pytest.mark.slow
+def test_a_map_that_was_tracked_under_another_camera_gives_its_frames_to_the_one_that_found_the_camera() -> None:
+    """Though it is the larger one: the wrong camera has bent it."""
+    system, _ = run(75)
+    lost, later = sorted(system.atlas.submaps)
+    held = [sum(pose.submap_id == m for pose in system.poses.values()) for m in (lost, later)]
+    assert held[0] > held[1]
+    system.events.add(EventKind.CALIBRATED, 74, 7.4, later, lost=[lost])
+    system.finish()
+    (event,) = system.events.of_kind(EventKind.REGISTERED)
+    assert (event.submap, event.data["old_submaps"]) == (later, [lost])
