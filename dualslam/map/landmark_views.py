@@ -49,13 +49,24 @@ def resection_covariance(
     known = np.isfinite(covariances).all((1, 2)) & (submap.depths(landmark_ids, T_cam_submap) > 0)
     if np.count_nonzero(known) < MIN_LANDMARKS:
         return None
-    J_pose, J_point = projection_jacobians(submap.K, T_cam_submap, submap.landmarks["xyz_mu"][landmark_ids[known]])
-    spread = J_point @ covariances[known] @ J_point.transpose(0, 2, 1) + sigma_px[known, None, None] ** 2 * np.eye(2)
+    J_pose, spread = pixel_covariances(submap, landmark_ids[known], sigma_px[known], T_cam_submap, covariances[known])
     H = (J_pose.transpose(0, 2, 1) @ np.linalg.solve(spread, J_pose)).sum(axis=0)
     try:
         return np.asarray(np.linalg.inv(H))
     except np.linalg.LinAlgError:
         return None
+
+
+def pixel_covariances(
+    submap: Submap, landmark_ids: IntArray, sigma_px: FloatArray, T_cam_submap: FloatArray, covariances: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return how landmarks' pixels change with the pose (N, 2, 6), and their covariances (N, 2, 2).
+
+    They have the noise of the image and that of the landmarks' places. Arguments as for `resection_covariance`.
+    """
+    J_pose, J_point = projection_jacobians(submap.K, T_cam_submap, submap.landmarks["xyz_mu"][landmark_ids])
+    by_place = J_point @ covariances @ J_point.transpose(0, 2, 1)
+    return J_pose, by_place + sigma_px[:, None, None] ** 2 * np.eye(2)
 
 
 def triangulate_landmarks(submap: Submap, landmark_ids: IntArray, before: int) -> FloatArray:

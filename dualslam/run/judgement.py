@@ -230,7 +230,7 @@ def _loose_joins(system: System, trajectories: Trajectories) -> list[Reason]:
 def _replaced(system: System, trajectories: Trajectories) -> list[Reason]:
     """Find frames that the main map has taken from another one whose path it contradicts: one is wrong."""
     centres = dict(zip(trajectories.main.index.tolist(), trajectories.main.T_world_cam[:, :3, 3], strict=True))
-    for earlier in (system.atlas.submaps[m] for m in system.atlas.submaps if m not in trajectories.main_submaps):
+    for earlier in (submap for m, submap in system.atlas.submaps.items() if m not in trajectories.main_submaps):
         index_of = {system.numbers.index_of(k): k for k in sorted(earlier.keyframes.keys() - earlier.condemned)}
         index = [i for i in index_of if i in centres]
         if len(index) < MIN_COMPARED:

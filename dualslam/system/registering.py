@@ -130,12 +130,13 @@ class Registering:
         left_out = set[int]()
         try:
             registration.run()
-            for _ in range(MAX_TRIES):
+            for tries_left in reversed(range(MAX_TRIES)):
                 added = self._found(registration, views.keys() - left_out)
                 if not (refused := self._unreached(submap, grown, added)):
                     break
                 left_out |= refused
-                registration.run_without(refused)
+                if tries_left:
+                    registration.run_without(refused)
         except SolverError as error:
             log.warning("no frame is registered in submap %d: %s", submap.id, error)
             return
@@ -171,7 +172,8 @@ class Registering:
         """Return the registered frames to which no steps of the camera lead from the submap's own."""
         if not added:
             return set()
-        own = [p for p in self._state.record.own_poses() if p.submap_id == before.id and p.index not in added]
+        taken = set(added)
+        own = [p for p in self._state.record.own_poses() if p.submap_id == before.id and p.index not in taken]
         poses = [FramePose(k, grown.keyframes[k].timestamp_s, grown.id, k, np.eye(4)) for k in added]
         path = Path.of([*own, *poses], grown)
         known = ~np.isin(path.index, added)

@@ -60,15 +60,15 @@ class Starting:
 
     def begin_again(self) -> None:
         """Look for the next map's start anew, as the pixels of the frames that are buffered have changed."""
-        self._begin_from(self._state.buffer.newest(self._reach))
+        self._collect(self._without_map_yet(self._state.buffer.newest(self._reach)))
 
     @property
     def _reach(self) -> int:
         return REACH_IN_TIME if self._state.pace.in_real_time else START_REACH
 
-    def _begin_from(self, waiting: Iterable[View]) -> None:
+    def _without_map_yet(self, views: Iterable[View]) -> list[View]:
         rows = self._state.record.rows
-        self._collect([view for view in waiting if rows[view.index].submap is None])
+        return [view for view in views if rows[view.index].submap is None]
 
     def _collect(self, views: list[View]) -> None:
         self._starter = self._state.parts.new_starter()
@@ -226,9 +226,9 @@ class Starting:
         state.relocaliser.end()  # it is of the pixels of before
         *waiting, newest = state.buffer.newest(self._reach + 1)
         tries_again, self._is_held_back = self._is_held_back and not state.pace.in_real_time, False
-        self._begin_from([] if tries_again else waiting)
-        rows = state.record.rows
-        return [*(v for v in waiting if tries_again and rows[v.index].submap is None), newest]
+        free = self._without_map_yet(waiting)
+        self._collect([] if tries_again else free)
+        return [*(free if tries_again else []), newest]
 
     def begin(self, start: Start) -> Track | Failure:
         """Make a submap of a start, and pose the frames before and between by reverse tracking over the buffer."""

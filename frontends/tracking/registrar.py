@@ -11,7 +11,7 @@ from dualslam.core.chi_square import CHI2_99, squared_distances
 from dualslam.core.config.settings import Config
 from dualslam.core.firsts import is_first
 from dualslam.core.geometry import se3
-from dualslam.core.geometry.projection import project_points, projection_jacobians
+from dualslam.core.geometry.projection import project_points
 from dualslam.core.geometry.two_view import fundamental_from_pose, sampson_error
 from dualslam.core.interfaces import Frontend
 from dualslam.core.noise_model import MIN_CONSENSUS, PROOF_VIEWS
@@ -20,7 +20,7 @@ from dualslam.frontends.gap.second_pose import refuse_second_pose
 from dualslam.frontends.tracking.mapper import Mapper
 from dualslam.frontends.tracking.resection import estimate_pose
 from dualslam.frontends.tracking.two_view_hypotheses import estimate_relative_pose
-from dualslam.map.landmark_views import landmark_covariances
+from dualslam.map.landmark_views import landmark_covariances, pixel_covariances
 from dualslam.map.submap import NO_LANDMARK, Submap
 
 BEFORE = 4
@@ -119,10 +119,8 @@ class Registrar:
         """Return which landmarks (N,) are too uncertain to contradict a pose that shows them beside these features."""
         submap = self._submap
         covariances = landmark_covariances(submap, landmark_ids)
-        xyz = submap.landmarks["xyz_mu"][landmark_ids]
-        uv, depth = project_points(submap.K, T_cam_submap, xyz)
-        J = projection_jacobians(submap.K, T_cam_submap, xyz)[1]
-        spread = J @ covariances @ J.transpose(0, 2, 1) + features.sigma_px[:, None, None] ** 2 * np.eye(2)
+        uv, depth = project_points(submap.K, T_cam_submap, submap.landmarks["xyz_mu"][landmark_ids])
+        _, spread = pixel_covariances(submap, landmark_ids, features.sigma_px, T_cam_submap, covariances)
         known = np.isfinite(spread).all((1, 2)) & (depth > 0)
         off2 = np.zeros(len(landmark_ids))
         off2[known] = squared_distances((uv - features.uv_rect_px)[known], spread[known])

@@ -17,9 +17,9 @@ from dualslam.core.types import FloatArray
 from dualslam.lab.synthetic.painter import NoiseBank, Painter
 
 SUN = np.array([0.6, 0.8])
+"""(x, z) along which the light comes in."""
 MAX_BYTES = 120_000_000
 """Of the finest levels that are kept; the coarser ones add up to three times as much."""
-"""(x, z) along which the light comes in."""
 Material = Callable[[Painter], None]
 U8Image = NDArray[np.uint8]
 
