@@ -6,12 +6,12 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from traceback import walk_tb
 
+from dualslam.atlas.stored_map import StoredMap
 from dualslam.core.camera.base import Camera
 from dualslam.core.config.settings import AttemptConfig, Config, FrontendConfig
 from dualslam.core.errors import ConfigError, FrontendError, InputError
 from dualslam.frontends.features.motion_statistics import nearest_search
 from dualslam.frontends.registry import check_frontend, create_pixel_matcher, package_of
-from dualslam.io.map_store import StoredMap
 
 
 def check_config(config: Config) -> None:

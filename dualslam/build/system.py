@@ -9,6 +9,7 @@ from functools import partial
 
 import numpy as np
 
+from dualslam.atlas.stored_map import StoredMap
 from dualslam.atlas.tidying import tidy
 from dualslam.backend.final_refinement import refine_submap
 from dualslam.backend.registration_bundle import adjust_and_prune
@@ -45,7 +46,6 @@ from dualslam.frontends.tracking.pixel_search import PixelSearch
 from dualslam.frontends.tracking.registrar import Registrar
 from dualslam.frontends.tracking.rolling_shutter import RollingShutter
 from dualslam.frontends.tracking.visual import VisualFrontEnd
-from dualslam.io.map_store import StoredMap
 from dualslam.lab.disturbances import FaultScript
 from dualslam.map.graph_beside import BesideGraphs
 from dualslam.map.lens import Calibration

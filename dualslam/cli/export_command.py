@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from dualslam.atlas.stored_map import StoredMap
 from dualslam.cli.outputs import check_free
 from dualslam.cli.view_command import save_recording
 from dualslam.core.errors import DualSlamError, InputError, OutputError
@@ -23,7 +24,6 @@ from dualslam.io.export.formats import FORMATS
 from dualslam.io.export.images import mask_of, undistorted, with_images
 from dualslam.io.export.mcap import write_mcap
 from dualslam.io.export.metric import by_distance
-from dualslam.io.map_store import StoredMap
 from dualslam.io.metric_scale import read_scale
 from dualslam.io.run_folder import MAP, TRAJECTORY, TRAJECTORY_KITTI
 from dualslam.io.run_reading import read_numbers, read_summary

@@ -6,11 +6,12 @@ import ctypes
 import resource
 import sys
 
+MB = 2**20
 M_TRIM_THRESHOLD, M_MMAP_THRESHOLD, M_ARENA_MAX = -1, -3, -8
 """As in glibc's `malloc.h`."""
-KEPT_BYTES = 256 * 2**20
+KEPT_BYTES = 256 * MB
 """So much at most lies idle; SIFT's scale space of a KITTI image takes 110 MB."""
-LARGEST_BYTES = 32 * 2**20
+LARGEST_BYTES = 32 * MB
 """Larger arrays are given back all the same: glibc allows no more."""
 
 
@@ -40,4 +41,4 @@ def peak_rss_mb(with_children: bool = False) -> float:
     """
     whose = (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN) if with_children else (resource.RUSAGE_SELF,)
     peak = sum(resource.getrusage(who).ru_maxrss for who in whose)
-    return peak / 2**20 if sys.platform == "darwin" else peak / 2**10
+    return peak / MB if sys.platform == "darwin" else peak / 2**10

@@ -2,23 +2,24 @@
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dualslam.atlas.atlas import Atlas, Link, LinkKind, rollover_covariance
+from dualslam.atlas.atlas import Atlas, Link, LinkKind, joined, rollover_covariance
+from dualslam.atlas.stored_map import StoredMap
 from dualslam.atlas.trajectory import FramePose
 from dualslam.atlas.warp import Warp
 from dualslam.core.camera.base import Camera
 from dualslam.core.camera.models import camera_from_dict
 from dualslam.core.errors import InputError
-from dualslam.io.colours import Colours, load_colours
+from dualslam.core.types import FloatArray
+from dualslam.io.colours import load_colours
 from dualslam.io.map_checks import FRAME_ROWS, HELD_ROWS, LINK_ROWS, PLACED_ROWS, WARP_ROWS, check_rows
 from dualslam.io.map_files import (
     METADATA,
@@ -37,29 +38,6 @@ LINKS, FRAMES, SUBMAP, SOLUTION = "links", "frames", "submap_", "solution"
 _OTHER = (LINKS, FRAMES, SOLUTION)
 _EARLIER_SURE = 0.025
 """Standard deviation of the scale up to which versions that did not save `is_sure` relied on a link."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class StoredMap:
-    """A map written by `save_atlas`: the submaps with their links, and where each frame stands."""
-
-    atlas: Atlas
-    poses: dict[int, FramePose]
-    camera: Camera | None = None
-    """By which the features are rectified, with what was found out about it; None in maps of before it was kept."""
-    colours: Colours = field(default_factory=dict)
-    """mapping of int to (N, 3) uint8: of each submap's landmarks; none where the map was saved without."""
-
-    @property
-    def next_id(self) -> int:
-        """The first number that no frame of the map has: the count of frames goes on there."""
-        kept = (k for m in self.atlas.submaps.values() for k in (*m.keyframes, *m.anchors))
-        return 1 + max([*self.poses, *kept], default=-1)
-
-    @property
-    def main(self) -> list[int]:
-        """The linked set of submaps with most posed frames: its first one's frame is the world of the saved run."""
-        return self.atlas.largest(Counter(pose.submap_id for pose in self.poses.values()))
 
 
 def submap_path(folder: Path, submap_id: int) -> Path:
@@ -149,21 +127,27 @@ def load_camera(folder: str | Path) -> Camera | None:
         return _camera(metadata)
 
 
-def load_joints(folder: str | Path) -> tuple[list[int], Atlas]:
-    """Read the ids of a map's submaps and how they are joined, from its ``map`` folder, and nothing larger.
+def load_placement(folder: Path, submap_ids: Iterable[int | None]) -> tuple[list[int], Mapping[int, FloatArray]]:
+    """Read how a map's submaps are joined, from its ``map`` folder, and nothing larger.
 
-    Returns list of int, Atlas: the atlas has links and what was solved of them, but no submaps.
+    - `submap_ids`: of them the first is asked about; None counts as no submap.
 
-    Raises `InputError` if there is no map, or it is damaged.
+    Returns list of int, mapping of int to (4, 4): what is joined with it, and each one's transform into their world.
+    Both are empty where there is no map, or it lacks the submap.
+
+    Raises `InputError` if the map is damaged.
     """
-    folder = Path(folder)
+    asked = min((m for m in submap_ids if m is not None), default=None)
+    if asked is None or not (folder / METADATA).is_file():
+        return [], {}
     files, metadata = read_index(folder)
     with _naming_damage(folder):
         ids = sorted(int(name.removeprefix(SUBMAP)) for name in files if name not in _OTHER)
         solution = load_arrays(files[SOLUTION]) if SOLUTION in files else None
         atlas = Atlas()
         _join(atlas, ids, load_arrays(files[LINKS]), solution, metadata)
-        return ids, atlas
+        component = next((c for c in joined(ids, atlas.believed) if asked in c), [])
+        return component, atlas.S_world_submap(component) if component else {}
 
 
 def _solution_arrays(atlas: Atlas) -> dict[str, NDArray[Any]]:

@@ -24,9 +24,9 @@ from itertools import islice
 
 import numpy as np
 
+from dualslam.core.memory import MB
 from dualslam.core.types import LateFrame, View
 
-MB = 2**20
 SLOW_HZ = 5.0
 """Half the rate of the slowest usual recording. A slower clock leaves as many frames as this rate: not a handful."""
 

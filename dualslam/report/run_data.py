@@ -11,15 +11,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dualslam.atlas.atlas import joined
 from dualslam.core.config import strict_yaml
 from dualslam.core.errors import InputError
 from dualslam.core.extras import how_to_install
 from dualslam.core.geometry import sim3
 from dualslam.core.types import BoolArray, FloatArray, FrameStatus, IntArray
 from dualslam.io import run_folder
-from dualslam.io.map_files import METADATA, load_arrays
-from dualslam.io.map_store import load_joints, submap_path
+from dualslam.io.map_files import load_arrays
+from dualslam.io.map_store import load_placement, submap_path
 from dualslam.io.run_folder import FrameRow, unlinked_submaps
 from dualslam.io.run_reading import read_events, read_frames, read_samples, read_summary
 from dualslam.io.trajectory_files import MAX_DT_S, Trajectory, associate, read_text, read_tum
@@ -187,7 +186,7 @@ def _truth_on_rows(truth: Trajectory, times_s: FloatArray) -> PosedRows:
 
 def _map_points(folder: Path, submap_ids: set[int | None]) -> FloatArray:
     """Read landmarks of the main map in its frame: the arrays that are needed, of the many that a map holds."""
-    component, S_world_submap = linked_submaps(folder, submap_ids)
+    component, S_world_submap = load_placement(folder, submap_ids)
     clouds = [np.zeros((0, 3))]
     for m in component:
         arrays = load_arrays(submap_path(folder, m), _POINT_ARRAYS, (CONDEMNED,))
@@ -200,18 +199,3 @@ def are_shown(arrays: Mapping[str, NDArray[Any]]) -> BoolArray:
     """Return which landmarks of a stored submap belong into a picture: none that a by-pass has marked invalid."""
     shown = arrays["landmarks_alive"] & (arrays["landmarks_distance_mu"] < MAX_VIEW_DISTANCE_MU)
     return np.asarray(shown & ~arrays[CONDEMNED] if CONDEMNED in arrays else shown)
-
-
-def linked_submaps(folder: Path, submap_ids: set[int | None]) -> tuple[list[int], Mapping[int, FloatArray]]:
-    """Return the submaps that are linked with the first of some, and the transform of each into their world.
-
-    None where there is no map, or no submap to begin with.
-    """
-    ids = sorted(m for m in submap_ids if m is not None)
-    if not ids or not (folder / METADATA).is_file():
-        return [], {}
-    stored, atlas = load_joints(folder)
-    ordered = next((c for c in joined(stored, atlas.believed) if ids[0] in c), [])
-    if not ordered:
-        return [], {}
-    return ordered, atlas.S_world_submap(ordered)

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
+from dualslam.atlas.stored_map import StoredMap
 from dualslam.build import build_system
 from dualslam.core.camera.base import Camera
 from dualslam.core.camera.corrected import CorrectedCamera
@@ -21,7 +22,7 @@ from dualslam.core.errors import InputError
 from dualslam.core.geometry.so3 import exp
 from dualslam.core.interfaces import Sequence
 from dualslam.core.types import FloatArray, Frame, Track
-from dualslam.io.map_store import StoredMap, load_atlas, load_camera
+from dualslam.io.map_store import load_atlas, load_camera
 from dualslam.io.reduced import resized_frames
 
 log = logging.getLogger(__name__)

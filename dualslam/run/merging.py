@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from dualslam.atlas.renumbering import bring_to_pixels, renumbered
+from dualslam.atlas.stored_map import StoredMap
 from dualslam.build import build_system, create_frontend
 from dualslam.core.camera.mapped import own_camera
 from dualslam.core.config.files import load_run_config
@@ -18,7 +19,6 @@ from dualslam.core.events import EventKind
 from dualslam.core.memory import peak_rss_mb
 from dualslam.core.metric_problem import MeasurementSource
 from dualslam.io.export.exported_map import read_stored
-from dualslam.io.map_store import StoredMap
 from dualslam.io.run_folder import FRAMES, TRAJECTORIES_MERGED, TRAJECTORY, check_vacant
 from dualslam.io.run_reading import read_frames, read_numbers, read_summary
 from dualslam.io.trajectory_files import write_tum

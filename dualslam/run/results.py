@@ -19,12 +19,11 @@ from dualslam.core.config.settings import Config
 from dualslam.core.errors import InputError
 from dualslam.core.events import EventKind
 from dualslam.core.geometry import sim3
-from dualslam.core.memory import peak_rss_mb
+from dualslam.core.memory import MB, peak_rss_mb
 from dualslam.core.types import FloatArray
 from dualslam.io.run_folder import FrameRow
 from dualslam.io.trajectory_files import MAX_DT_S, Trajectory, associate
 from dualslam.lab.metrics.trajectory_metrics import score_trajectory
-from dualslam.recovery.frame_buffer import MB
 from dualslam.run.claims import Claim, claims_in_atlas
 from dualslam.run.runner import RunReport
 from dualslam.system.audit.verdict import Verdict

@@ -10,6 +10,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from dualslam.atlas.stored_map import StoredMap
 from dualslam.build import build_system
 from dualslam.core.camera.base import Camera
 from dualslam.core.config.files import load_config
@@ -20,7 +21,7 @@ from dualslam.core.metric_problem import MeasurementSource
 from dualslam.core.trajectory import Trajectory
 from dualslam.core.types import BoolArray, Frame
 from dualslam.io.export.exported_map import ExportedMap, flatten
-from dualslam.io.map_store import StoredMap, load_atlas
+from dualslam.io.map_store import load_atlas
 from dualslam.io.masks import read_mask
 from dualslam.io.times import UNIT_NAMES, epoch_unit
 from dualslam.map.frame_records import FrameResult

@@ -14,12 +14,12 @@ from dualslam.atlas.record import FrameStamp
 from dualslam.atlas.trajectory import FramePose, Path
 from dualslam.core.errors import SolverError
 from dualslam.core.events import EventKind
+from dualslam.core.memory import MB
 from dualslam.core.noise_model import MAX_TRIES, PROOF_VIEWS
 from dualslam.core.types import FailureReason, FrameMethod, FrameStatus, View
 from dualslam.linking.motion import find_reached
 from dualslam.map.frame_observations import FrameObservations
 from dualslam.map.submap import Submap
-from dualslam.recovery.frame_buffer import MB
 from dualslam.recovery.registration import REACH, Registration
 from dualslam.system.state import State
 

@@ -6,6 +6,7 @@ from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
 
 from dualslam.atlas.record import Record
+from dualslam.atlas.stored_map import StoredMap
 from dualslam.core.atlas_problem import AtlasSolver
 from dualslam.core.config.settings import Config
 from dualslam.core.interfaces import (
@@ -21,7 +22,6 @@ from dualslam.core.interfaces import (
 )
 from dualslam.core.types import Failure, Features, FloatArray, Frame, LateFrame, View
 from dualslam.core.walk_news import WalkWatch
-from dualslam.io.map_store import StoredMap
 from dualslam.map.graph_beside import BesideGraphs
 from dualslam.map.lens import Calibration
 from dualslam.map.submap import Submap

@@ -9,6 +9,7 @@ from functools import partial
 
 from dualslam.atlas.connections import Connections
 from dualslam.atlas.record import FrameStamp, Record
+from dualslam.atlas.stored_map import StoredMap
 from dualslam.atlas.trajectory import Worlds
 from dualslam.core.camera.base import Camera
 from dualslam.core.config.settings import Config
@@ -17,7 +18,6 @@ from dualslam.core.interfaces import SubmapGraph, VisualOdometry
 from dualslam.core.jobs import JobKind
 from dualslam.core.types import BoolArray, Failure, FailureReason, Frame, FrameStatus, Start, Track, View
 from dualslam.core.walk_news import WalkNews
-from dualslam.io.map_store import StoredMap
 from dualslam.map.frame_numbers import FrameNumbers
 from dualslam.map.frame_records import FrameResult, FrameRow
 from dualslam.map.submap import Submap

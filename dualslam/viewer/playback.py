@@ -15,11 +15,11 @@ from dualslam.core.geometry import sim3
 from dualslam.core.types import Failure, FloatArray, FrameStatus, IntArray
 from dualslam.io.colours import load_colours, padded
 from dualslam.io.map_files import METADATA, load_arrays
-from dualslam.io.map_store import submap_path
+from dualslam.io.map_store import load_placement, submap_path
 from dualslam.io.run_folder import MAP, SUMMARY, FrameRow
 from dualslam.map.frame_numbers import FrameNumbers
 from dualslam.report.placement import align
-from dualslam.report.run_data import CONDEMNED, PosedRows, RunData, are_shown, linked_submaps
+from dualslam.report.run_data import CONDEMNED, PosedRows, RunData, are_shown
 from dualslam.report.statuses import WITHOUT_POSE
 
 _ARRAYS = (
@@ -123,7 +123,7 @@ def _map_parts(run: RunData, rows: Sequence[FrameRow], submap: int | None) -> tu
     """Read the keyframes and landmarks of the main map, or of one submap in its own frame."""
     folder = run.path / MAP
     if submap is None:
-        component, S_world_submap = linked_submaps(folder, {row.submap for row in rows if row.in_main_map})
+        component, S_world_submap = load_placement(folder, (row.submap for row in rows if row.in_main_map))
     else:
         component, S_world_submap = [submap] if (folder / METADATA).is_file() else [], {submap: np.eye(4)}
     first_id = run.summary.get("first_id", 0)

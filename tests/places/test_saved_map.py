@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from dualslam.atlas.stored_map import StoredMap
 from dualslam.build import build_system
 from dualslam.core.config.settings import Config
 from dualslam.core.events import EventKind
@@ -17,7 +18,7 @@ from dualslam.core.geometry import se3
 from dualslam.core.geometry.umeyama import umeyama
 from dualslam.core.types import Failure, Frame, Track, View
 from dualslam.frontends.tracking.visual import VisualFrontEnd
-from dualslam.io.map_store import StoredMap, load_atlas, save_atlas
+from dualslam.io.map_store import load_atlas, save_atlas
 from dualslam.run.results import frame_rows, trajectories_of
 from dualslam.system.system import System
 from dualslam.testing.point_world import CAMERA, PointWorld

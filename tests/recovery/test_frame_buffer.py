@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from dualslam.core.grey_image import GreyImage
+from dualslam.core.memory import MB
 from dualslam.core.types import LateFrame, View
-from dualslam.recovery.frame_buffer import MB, FrameBuffer
+from dualslam.recovery.frame_buffer import FrameBuffer
 from dualslam.testing.point_world import random_features
 
 RNG = np.random.default_rng(5)

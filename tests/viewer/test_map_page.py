@@ -17,7 +17,7 @@ import pytest
 from dualslam.core.types import FloatArray
 from dualslam.io.colours import save_colours, save_pictures
 from dualslam.io.map_files import load_arrays
-from dualslam.io.map_store import load_joints, submap_path
+from dualslam.io.map_store import load_atlas, submap_path
 from dualslam.io.metric_scale import write_scale
 from dualslam.io.run_folder import MAP
 from dualslam.report import RunData, report_page
@@ -67,7 +67,7 @@ def test_landmarks_appear_with_the_frame_that_brought_them(page: str, broken_run
 def test_landmarks_have_the_colours_of_the_images(broken_run: RunData, tmp_path: Path) -> None:
     shutil.copytree(broken_run.path / MAP, tmp_path / MAP)
     _, of_submaps, _ = unpacked(drawn(map_page(broken_run) or "")["landmarks"])
-    ids, _ = load_joints(tmp_path / MAP)
+    ids = load_atlas(tmp_path / MAP).atlas.submaps
     n = {m: len(load_arrays(submap_path(tmp_path / MAP, m), ["landmarks_alive"])["landmarks_alive"]) for m in ids}
     save_colours(tmp_path / MAP, {m: np.tile(np.array([200, 100, 50 + m], np.uint8), (n[m], 1)) for m in ids})
     _, colours, _ = unpacked(drawn(map_page(replace(broken_run, path=tmp_path)) or "")["landmarks"])

@@ -10,12 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dualslam.atlas.atlas import Atlas
+from dualslam.atlas.stored_map import StoredMap
 from dualslam.atlas.trajectory import FramePose, compose
 from dualslam.core.errors import InputError
 from dualslam.core.geometry import se3, sim3
 from dualslam.core.types import BoolArray, FloatArray, IntArray
 from dualslam.io.colours import padded
-from dualslam.io.map_store import StoredMap, load_atlas
+from dualslam.io.map_store import load_atlas
 
 MIN_VIEWS = 2
 """Landmarks that fewer of the exported keyframes see are left out."""

@@ -11,6 +11,7 @@ import gtsam
 import numpy as np
 import pytest
 
+from dualslam.atlas.stored_map import StoredMap
 from dualslam.cli import main
 from dualslam.core.errors import InputError
 from dualslam.core.geometry import se3
@@ -25,7 +26,6 @@ from dualslam.io.export.g2o import write_g2o
 from dualslam.io.export.images import mask_of, with_images
 from dualslam.io.export.nerfstudio import write_nerfstudio
 from dualslam.io.export.ply import write_ply
-from dualslam.io.map_store import StoredMap
 from dualslam.testing.point_world import CAMERA, PointWorld, cloud, hand_held, system_in
 
 

@@ -12,13 +12,13 @@ import numpy as np
 import pytest
 
 from dualslam.atlas.atlas import Atlas
+from dualslam.atlas.stored_map import StoredMap
 from dualslam.cli import main
 from dualslam.core.errors import InputError
 from dualslam.core.geometry import se3
 from dualslam.core.types import FloatArray, Frame
 from dualslam.io.export.exported_map import ExportedMap
 from dualslam.io.export.metric import DICTIONARIES, by_distance, by_height, by_marker
-from dualslam.io.map_store import StoredMap
 from dualslam.io.metric_scale import SCALE, read_scale, write_scale
 from dualslam.io.run_folder import FRAME_COLUMNS
 from dualslam.io.run_reading import read_numbers
