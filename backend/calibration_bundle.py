@@ -33,6 +33,7 @@ class CalibratedOptimum:
     from it."""
     correction: FloatArray  # (5,): of the camera as it was given
     covariance: FloatArray  # (5, 5): of the correction, by the Hessian, prior and all
+    follows: FloatArray  # (K, 6, 5): with a change d of the correction the poses go to ``T_submap_kf exp(follows @ d)``
     noise_ratio: float  # of the typical residual to its sigma
     # Sum of the Huber losses, and the prior's.
     cost_before: float
@@ -104,7 +105,7 @@ def optimise_with_camera(
     return CalibratedOptimum(
         state.T_submap_kf,
         state.lens,
-        System(kept, partial(huber, k=robust_k), lens).lens_covariance(state),
+        *System(kept, partial(huber, k=robust_k), lens).about_lens(state),
         _noise_ratio(kept, state),
         found.cost_before,
         found.cost_after,

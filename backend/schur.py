@@ -249,16 +249,19 @@ class System:
         T[self._free] = T[self._free] @ se3.exp(xi)
         return State(T, xyz_mu, state.lens + d_lens)
 
-    def lens_covariance(self, state: State) -> FloatArray:
-        """Return (M, M): the marginal covariance of the lens, by the weights at a state.
+    def about_lens(self, state: State) -> tuple[FloatArray, FloatArray]:
+        """Return the marginal covariance of the lens (M, M), and how poses follow it (F, 6, M), by a state's weights.
 
-        Raises `SolverError` if the system is not definite.
+        With a change d of the lens the cost is least at ``T exp(follows @ d)``. Raises `SolverError` if the system is
+        not definite.
         """
         reduced, _ = self._without_points(state, FIRST_DAMPING, self._linear(state))
         solved = None if reduced is None else self._solve(reduced, FIRST_DAMPING)
         if solved is None:
             raise SolverError("the lens has no covariance: the system is not definite")
-        return np.asarray(np.linalg.inv(solved[2]), np.float64)
+        follows = np.zeros((len(state.T_submap_kf), 6, len(state.lens)))
+        follows[self._free] = -solved[1]
+        return np.asarray(np.linalg.inv(solved[2]), np.float64), follows
 
     def _linear(self, state: State) -> Iterator[_Linear]:
         fits = self._fits(state)

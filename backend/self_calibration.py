@@ -34,7 +34,7 @@ from dualslam.core.chi_square import CHI2_999
 from dualslam.core.config.calibration_config import CalibrationConfig
 from dualslam.core.errors import SolverError
 from dualslam.core.estimates import MAX_PRIOR_SIGMAS, CalibrationEstimate, PreferredCamera
-from dualslam.core.geometry import so3
+from dualslam.core.geometry import se3, so3
 from dualslam.core.geometry.umeyama import umeyama
 from dualslam.core.noise_model import INFLATION, PROOF_VIEWS
 from dualslam.core.types import Failure, FailureReason, FloatArray, IntArray
@@ -127,6 +127,7 @@ def find_preferred_camera(
         now, preferred = (answer.best.poses_under(each) for each in (present.vector, answer.correction))
     except (SolverError, np.linalg.LinAlgError):
         return None
+    off = np.zeros((0, 5)) if present_covariance is None else np.linalg.cholesky(present_covariance).T
     return PreferredCamera(
         float(answer.off[0]),
         math.sqrt(answer.covariance[0, 0]),
@@ -135,6 +136,7 @@ def find_preferred_camera(
         keyframe_ids,
         now,
         preferred,
+        preferred @ se3.exp(np.einsum("kij,nj->nki", answer.best.follows, off)),
     )
 
 

@@ -17,6 +17,7 @@ from collections import defaultdict
 import numpy as np
 
 import dualslam
+from dualslam.atlas.atlas import Atlas
 from dualslam.core.chi_square import CHI2_95
 from dualslam.core.geometry import se3
 from dualslam.core.noise_model import GROUP
@@ -26,7 +27,7 @@ from dualslam.lab.metrics.alignment import align_points
 from dualslam.lab.metrics.pose_consistency import pose_nees
 from dualslam.lab.synthetic import make_sequence
 from dualslam.map.submap import Submap
-from dualslam.run.claims import claims_of, stretches_of
+from dualslam.run.claims import claims_in_atlas, stretches_of
 
 AROUND = 4
 """Keyframes before and after that a position is aligned with."""
@@ -108,7 +109,9 @@ def collect(
 
 def compare(submap: Submap, truth: FloatArray, position: dict[str, list[float]], scale: dict[str, list[float]]) -> None:
     """Add the ratios of one map; `truth`: the true centres (F, 3) of all frames."""
-    claims = claims_of(submap)
+    alone = Atlas()
+    alone.add(submap)
+    claims = claims_in_atlas(alone)[submap.id]
     # What a by-pass has condemned claims nothing: no frame of the run goes by it.
     ids = np.array(sorted(submap.keyframes.keys() - submap.condemned))
     centres = submap.keyframe_poses(ids)[:, :3, 3]

@@ -103,6 +103,8 @@ class PreferredCamera:
     - `keyframe_ids` (K,) int64.
     - `T_now`, `T_preferred` (K, 4, 4): their poses by the same pixels alone, under the current camera and the preferred
       one; each in a frame and unit of its own.
+    - `T_off` (N, K, 4, 4): from the preferred one by one standard deviation of the camera's own covariance, in each of
+      its independent directions; none where the camera is as it was given.
     """
 
     log_focal: float
@@ -112,6 +114,7 @@ class PreferredCamera:
     keyframe_ids: IntArray
     T_now: FloatArray
     T_preferred: FloatArray
+    T_off: FloatArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)

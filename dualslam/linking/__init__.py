@@ -7,23 +7,21 @@ In reading order:
 - `timeline`: what the keyframes say one by one, in order of time,
 - `deformation`: how the maps are bent beyond a similarity,
 - `join_test`: the gates of all joins, and `verify`: what they ask of a link,
-- `live_end` propagates the link's covariance to the current frame, `camera_bend` detects bending by a wrong camera,
+- `live_end` propagates the link's covariance to the current frame: by the walk's loss of scale, and the camera's error,
 - `pairs`: the matches as measurements, `scale_observability`: how firmly a map holds its scale,
 - `motion`: the camera's motion across gaps and seams. `link_tries`: earlier tries.
 """
 
 from dualslam.linking.correspondences import Correspondences, DescriptorMatcher, propose_correspondences
 from dualslam.linking.estimate import LinkEstimate, LinkRefusal, estimate_link
-from dualslam.linking.live_end import NO_BEND, Bend, check_camera, propagate_to_live_end
+from dualslam.linking.live_end import add_camera, propagate_to_live_end
 
 __all__ = [
-    "NO_BEND",
-    "Bend",
     "Correspondences",
     "DescriptorMatcher",
     "LinkEstimate",
     "LinkRefusal",
-    "check_camera",
+    "add_camera",
     "estimate_link",
     "propagate_to_live_end",
     "propose_correspondences",

@@ -9,12 +9,15 @@ solved from the same observations alone: other ties would count as an effect of 
 Of that, chance has its share: pixels of an exact camera ask for another one, too. A correction at a squared distance of
 d2 makes a change of at most sqrt(d2) of that change's standard deviations, in any direction (Cauchy-Schwarz). So chance
 makes at least the part 1 / d2 of the change's square on average. The rest counts.
+
+A camera that was estimated is itself known to a covariance only. What the map changes under a camera that is one
+standard deviation off, in each independent direction, counts beside it. In a bend 1 % of focal length is 10 % of scale.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -25,7 +28,7 @@ from dualslam.core.geometry import se3, sim3, so3
 from dualslam.core.noise_model import GROUP
 from dualslam.core.types import Failure, FailureReason, FloatArray, IntArray
 from dualslam.linking.estimate import LinkEstimate, LinkRefusal
-from dualslam.linking.join_test import LinkEvidence, live_scale_gate
+from dualslam.linking.join_test import JoinGate, LinkEvidence, live_scale_gate
 from dualslam.linking.scale_observability import scale_sigma_between
 from dualslam.map.submap import Submap
 
@@ -37,17 +40,18 @@ MAX_KEYFRAMES = 60
 class Bend:
     """How one end of a map would lie to the other under another camera."""
 
-    log_scale: float = 0.0  # logarithm of its scale there over the current one
-    rotation_rad: float = 0.0
-    doubt: Failure | None = None  # why a link is not to be relied on with it
+    log_scale: float  # logarithm of its scale there over the current one
+    rotation_rad: float
 
     def beyond_chance(self, distance2: float) -> Bend:
         """Return what counts of it, if the pixels ask for the other camera by this squared distance."""
         share = math.sqrt(max(0.0, 1.0 - 1.0 / distance2)) if distance2 > 0 else 0.0
         return Bend(share * self.log_scale, share * self.rotation_rad)
 
-
-NO_BEND = Bend()
+    def beside(self, others: Sequence[Bend]) -> Bend:
+        """Return the root of the sum of squares of it and others, which are independent of it."""
+        every = (self, *others)
+        return Bend(math.hypot(*(b.log_scale for b in every)), math.hypot(*(b.rotation_rad for b in every)))
 
 
 def measure_bend(T_now: FloatArray, T_other: FloatArray, here: IntArray, there: IntArray) -> Bend:
@@ -62,53 +66,52 @@ def measure_bend(T_now: FloatArray, T_other: FloatArray, here: IntArray, there: 
     return Bend(log_scale, float(np.linalg.norm(so3.log(R_here.T @ R_there))))
 
 
-def check_camera(
-    submap: Submap,
+def add_camera(
     link: LinkEstimate,
+    new: Submap,
     live_since: int,
     find: Callable[[Submap, IntArray], PreferredCamera | None],
     config: LinkingConfig,
-) -> Bend | Failure:
-    """Return the bend that the camera may have made in a new map, none where its pixels say nothing of it.
+) -> LinkEstimate | Failure:
+    """Add to a link's covariance by what the camera may have bent the new map, and refuse it where that is too much.
 
-    - `submap`: as the walk has left it.
     - `link`: carried to the live end.
-    - `live_since`: the keyframe that the walk set out from.
+    - `new`, `live_since`: as in `propagate_to_live_end`.
     - `find`: asks keyframes of the submap about the camera.
 
-    Returns Bend or Failure: a failure if the link with this bend is too unsure to join the maps. A bend with a `doubt`
-    if it joins them, but is too unsure to rely on. The reason is the camera if it is contradicted beyond chance.
+    Returns LinkEstimate or Failure: unchanged where the pixels say nothing of the camera. The numbers have the camera's
+    share of the scale, `sigma_scale_camera`. The reason of a refusal is the camera if it is contradicted beyond chance.
     Otherwise it is the scale, which more keyframes may decide.
     """
-    ids = np.array(sorted(submap.keyframes), np.int64)
+    ids = np.array(sorted(new.keyframes), np.int64)
     here, there = _places(ids, link.agreeing_keyframes, live_since)
     ids = ids[(ids >= min(here[0], there[0])) & (ids <= max(here[-1], there[-1]))]
     if len(ids) > MAX_KEYFRAMES:
         ids = ids[np.linspace(0, len(ids) - 1, MAX_KEYFRAMES).astype(np.int64)]
-    found = find(submap, ids)
+    found = find(new, ids)
     if found is None:
-        return NO_BEND
+        return link
     rows = [np.flatnonzero(np.isin(ids, place)) for place in (here, there)]
     bend = Bend(math.inf, math.inf)
     if min(len(each) for each in rows) >= 2:
         bend = measure_bend(found.T_now, found.T_preferred, *rows).beyond_chance(found.distance2)
+        bend = bend.beside([measure_bend(found.T_preferred, T, *rows) for T in found.T_off])
     turn_deg = math.degrees(bend.rotation_rad)
-    sigma = math.hypot(link.sigma_scale, bend.log_scale)
-    turns = turn_deg > config.max_live_rotation_deg
-    if sigma <= config.max_live_scale_sigma and not turns:
-        return bend
-    numbers = {
-        "log_focal": found.log_focal,
-        "distance2": found.distance2,
-        "bend_scale": bend.log_scale,
-        "bend_deg": turn_deg,
-    }
-    by = f"focal length {found.log_focal:+.1%}, known to {found.log_focal_sigma:.1%}"
-    by += f", would bend it by {abs(bend.log_scale):.1%} and {turn_deg:.1f} deg"
-    why = Failure(FailureReason.SCALE, f"the new map hardly knows its camera: {by}", numbers)
+    says, reason = "hardly knows", FailureReason.SCALE
     if found.beyond_chance:
-        why = Failure(FailureReason.CAMERA, f"the new map contradicts its camera: {by}", numbers)
-    return why if turns or sigma > config.max_joined_scale_sigma else replace(bend, doubt=why)
+        says, reason = "contradicts", FailureReason.CAMERA
+    detail = f"the new map {says} its camera: focal length {found.log_focal:+.1%}, known to {found.log_focal_sigma:.1%}"
+    detail += f", would bend it by {bend.log_scale:.1%} and {turn_deg:.1f} deg"
+    evidence = LinkEvidence(
+        (
+            live_scale_gate(math.hypot(link.sigma_scale, bend.log_scale), detail, reason, config),
+            JoinGate.at_most("bend_deg", turn_deg, config.max_live_rotation_deg, reason, detail),
+        )
+    )
+    by_camera = {"sigma_scale_camera": bend.log_scale}
+    numbers = evidence.numbers | by_camera | {"log_focal": found.log_focal, "distance2": found.distance2}
+    refused = LinkRefusal(reason, detail, numbers, gates=evidence.comparisons)
+    return _carry(link, new, bend, by_camera, evidence, refused)
 
 
 def _places(ids: IntArray, agreeing: IntArray, live_since: int) -> tuple[IntArray, IntArray]:
@@ -139,25 +142,19 @@ is what is known badly, has grown."""
 
 
 def propagate_to_live_end(
-    link: LinkEstimate, new: Submap, live_since: int, config: LinkingConfig, bend: Bend = NO_BEND
+    link: LinkEstimate, new: Submap, live_since: int, config: LinkingConfig
 ) -> LinkEstimate | Failure:
     """Add to a link's covariance what reverse tracking has lost of the scale, and refuse it where that is too much.
 
-    So does what the map may be bent by its camera.
-
     - `new`: as the walk has left it.
     - `live_since`: the keyframe that the walk set out from: it and those after it are the live end.
-    - `bend`: of the new map, under the camera that its pixels ask for.
 
     Returns LinkEstimate or Failure: with its `sigma_scale` at the live end. The numbers have the walk's share of it,
-    `sigma_scale_reverse`, and the camera's, `sigma_scale_camera`, where there is one.
+    `sigma_scale_reverse`.
     """
     live = np.array([k for k in new.keyframes if k >= live_since], np.int64)
     walk = scale_sigma_between(new, link.agreeing_keyframes, live)
-    sigma = math.hypot(link.sigma_scale, walk, bend.log_scale)
-    numbers = {"sigma_scale": sigma, "sigma_scale_reverse": walk}
-    if bend.log_scale:
-        numbers["sigma_scale_camera"] = abs(bend.log_scale)
+    sigma = math.hypot(link.sigma_scale, walk)
     detail = "nothing holds the scale between the overlap and the live end"
     if math.isfinite(walk):
         detail = f"scale known to {sigma:.1%} at the live end, {walk:.1%} of it by the walk"
@@ -165,16 +162,30 @@ def propagate_to_live_end(
     hopeless = walk > (SETTLED if settled else HOPELESS) * config.max_live_scale_sigma
     reason = FailureReason.SCALE_LOST if hopeless else FailureReason.SCALE
     evidence = LinkEvidence((live_scale_gate(sigma, detail, reason, config),))
-    compared = evidence.comparisons
+    by_walk = {"sigma_scale_reverse": walk}
+    numbers = evidence.numbers | by_walk
+    refused = LinkRefusal(reason, detail, numbers, walk_sigma=walk, gates=evidence.comparisons)
+    return _carry(link, new, Bend(walk, 0.0), by_walk, evidence, refused)
+
+
+def _carry(
+    link: LinkEstimate, new: Submap, lost: Bend, share: dict[str, float], evidence: LinkEvidence, refused: LinkRefusal
+) -> LinkEstimate | LinkRefusal:
+    """Return a link with what the new map may have lost on the way to its live end, or its refusal.
+
+    The live end turns and grows about the place where the maps overlap.
+    """
     if not evidence.is_accepted:
-        return LinkRefusal(reason, detail, numbers, walk_sigma=walk, gates=compared)
-    # The live end grows and shrinks about the place where the maps overlap.
+        return refused
     held = [k for k in link.agreeing_keyframes.tolist() if k in new.keyframes]
     about = sim3.adjoint(se3.from_parts(np.eye(3), new.keyframe_poses(held)[:, :3, 3].mean(0)))
-    lost = np.diag([bend.rotation_rad**2] * 3 + [0.0] * 3 + [walk**2 + bend.log_scale**2])
-    covariance = link.covariance + about @ lost @ about.T
-    known = link.numbers | numbers
-    carried = replace(link, covariance=covariance, sigma_scale=sigma, numbers=known, gates=(*link.gates, *compared))
-    if evidence.is_sure:
-        return carried
-    return LinkRefusal(reason, detail, numbers, walk_sigma=walk, unsure=carried, gates=compared)
+    C = np.diag([lost.rotation_rad**2] * 3 + [0.0] * 3 + [lost.log_scale**2])
+    sigma = math.hypot(link.sigma_scale, lost.log_scale)
+    carried = replace(
+        link,
+        covariance=link.covariance + about @ C @ about.T,
+        sigma_scale=sigma,
+        numbers=link.numbers | share | {"sigma_scale": sigma},
+        gates=(*link.gates, *evidence.comparisons),
+    )
+    return carried if evidence.is_sure else replace(refused, unsure=carried)

@@ -11,7 +11,7 @@ import numpy as np
 from dualslam.core.geometry import sim3
 from dualslam.core.noise_model import GROUP
 from dualslam.core.types import Failure
-from dualslam.linking import LinkEstimate, LinkRefusal, check_camera, propagate_to_live_end
+from dualslam.linking import LinkEstimate, LinkRefusal, add_camera, propagate_to_live_end
 from dualslam.linking.rivals import choose_by_velocity
 from dualslam.map.submap import Submap
 from dualslam.recovery.job import FoundLink, RecoveryParts
@@ -135,7 +135,7 @@ def confirm_link(
 def _propagate(
     walk: Walk, parts: RecoveryParts, result: LinkEstimate | Failure, doubts: list[Failure] | None
 ) -> LinkEstimate | Failure:
-    """Carry a link to the live end, once its camera is checked; `doubts` takes what is to be said against it."""
+    """Carry a link to the live end, with what its camera bends; `doubts` takes what is to be said against it."""
 
     def held(refused: LinkEstimate | Failure) -> LinkEstimate | Failure:
         if doubts is None or not isinstance(refused, LinkRefusal) or refused.unsure is None:
@@ -148,14 +148,7 @@ def _propagate(
         return found
     if isinstance(link := held(propagate_to_live_end(found, submap, newest, config)), Failure):
         return link
-    bend = check_camera(submap, link, newest, partial(parts.find_camera, walk.job), config)
-    if isinstance(bend, Failure):
-        return bend
-    if bend.doubt is not None:
-        doubted = held(LinkRefusal(bend.doubt.reason, bend.doubt.detail, bend.doubt.numbers, unsure=link))
-        if isinstance(doubted, Failure):
-            return doubted
-    return held(propagate_to_live_end(found, submap, newest, config, bend))
+    return held(add_camera(link, submap, newest, partial(parts.find_camera, walk.job), config))
 
 
 def _refuse_rivalled(walk: Walk, old_id: int, link: LinkEstimate) -> Failure | None:

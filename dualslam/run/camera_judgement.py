@@ -8,7 +8,6 @@ from dualslam.core.camera.calibrated_size import find_calibrated_size
 from dualslam.core.camera.mapped import own_camera
 from dualslam.core.estimates import MAX_PRIOR_SIGMAS
 from dualslam.core.events import Event, EventKind
-from dualslam.map.lens import SURE_SIGMA
 from dualslam.system.audit.verdict import Level, ReasonCode
 from dualslam.system.system import System
 
@@ -25,39 +24,30 @@ sigmas from their median.
 _FOCAL, _FOCAL_SIGMA, _PATH_CHANGE = "log_focal", "log_focal_sigma", "path_change"
 
 
-def judge_camera(system: System) -> tuple[ReasonCode, Level, str] | None:
-    """Return the reason that the camera is against a run, and its text; None where it is none.
+def judge_camera(system: System) -> tuple[tuple[ReasonCode, Level, str] | None, dict[str, float]]:
+    """Return the reason that the camera is against a run, if it is one, with its text; and scores by the codes.
 
     A wrong camera that was corrected in time, or changes the path little, is no reason.
     """
+    answers, sigma = _answers(system), system.log_focal_sigma
+    scores = {str(ReasonCode.CAMERA): event.data[_PATH_CHANGE] for event in answers[-1:]}
+    scores |= {} if sigma is None else {str(ReasonCode.FOCAL): sigma}
     given = own_camera(system.camera)
     if (size := find_calibrated_size(given)) is not None:
         text = (
             f"By its principal point the calibration is for images of {size[0]} x {size[1]} pixels. These have "
             f"{given.width} x {given.height}. Scale the calibration to them."
         )
-        return ReasonCode.CAMERA, Level.DOUBTFUL, text
-    if (found := _by_answers(_answers(system))) is not None:
-        return ReasonCode.CAMERA, *found
-    # In a bend 1 % of focal length costs 10 % of scale and more: what links join across one is no surer than that.
-    is_linked = bool(system.events.of_kind(EventKind.LINKED))
-    sigma = system.log_focal_sigma
-    if sigma is None or sigma < (SURE_SIGMA if is_linked else MAX_FOCAL_SIGMA):
-        return None
-    effect = "Maps that were joined may differ in scale by ten times as much. " if is_linked else ""
+        return (ReasonCode.CAMERA, Level.DOUBTFUL, text), scores
+    if (found := _by_answers(answers)) is not None:
+        return (ReasonCode.CAMERA, *found), scores
+    if sigma is None or sigma < MAX_FOCAL_SIGMA:
+        return None, scores
     text = (
-        f"The focal length is known to {100 * sigma:.1f} % only. {effect}"
+        f"The focal length is known to {100 * sigma:.1f} % only. "
         "Give a calibration with --camera, or record more sideways motion."
     )
-    return ReasonCode.FOCAL, Level.USABLE, text
-
-
-def camera_scores(system: System) -> dict[str, float]:
-    """Return how strongly a run speaks against its camera, by the reasons' codes."""
-    scores = {str(ReasonCode.CAMERA): event.data[_PATH_CHANGE] for event in _answers(system)[-1:]}
-    if system.log_focal_sigma is not None:
-        scores[str(ReasonCode.FOCAL)] = system.log_focal_sigma
-    return scores
+    return (ReasonCode.FOCAL, Level.USABLE, text), scores
 
 
 def _answers(system: System) -> list[Event]:

@@ -92,13 +92,6 @@ def _seen_from(largest: int, known: Mapping[int, _Known], links: Mapping[int, Li
     return seen
 
 
-def claims_of(submap: Submap) -> dict[int, Claim]:
-    """Return what a submap claims of its keyframes by itself."""
-    atlas = Atlas()
-    atlas.add(submap)
-    return claims_in_atlas(atlas)[submap.id]
-
-
 def _place(atlas: Atlas, link: Link, submap: Submap) -> IntArray:
     """Return a submap's keyframes by which a link was measured: those that both have, or those about its place."""
     shared = [k for k in link.keyframes if k in submap.keyframes]

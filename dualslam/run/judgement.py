@@ -13,7 +13,7 @@ from dualslam.core.noise_model import UNSURE_SCALE
 from dualslam.core.trajectory import Trajectory
 from dualslam.core.types import Failure, FrameStatus
 from dualslam.map.frame_records import FrameRow
-from dualslam.run.camera_judgement import MAX_PATH_CHANGE, camera_scores, judge_camera
+from dualslam.run.camera_judgement import MAX_PATH_CHANGE, judge_camera
 from dualslam.run.measuring import MANY_REJECTED, Measured
 from dualslam.run.results import Trajectories
 from dualslam.system.audit.photometric import Disagreement, Sample, find_disagreement
@@ -53,7 +53,7 @@ def judge_run(
     """
     if not rows:
         return Verdict(Level.DOUBTFUL)
-    reasons, scores = [*besides, *_coverage(system, rows), *_clock(rows)], {}
+    reasons, scores = [*besides, *_coverage(system, rows), *_clock(rows)], dict[str, float]()
     if crashed:
         text = "The run crashed: what it had found until then was kept. Report the error, and run again."
         reasons.append(_about_all(rows, ReasonCode.CRASHED, Level.USABLE, text))
@@ -62,13 +62,12 @@ def judge_run(
         reasons += [*_jumps(system, trajectories, *steps), *_photometric(system, found), *_scale(rows)]
         reasons += [*_loose_joins(system, trajectories), *_still(system, trajectories)]
         reasons += _replaced(system, trajectories)
-        if (camera := judge_camera(system)) is not None:
-            reasons.append(_about_all(rows, *camera))
-        scores = {
+        camera, scores = judge_camera(system)
+        reasons += [] if camera is None else [_about_all(rows, *camera)]
+        scores |= {
             str(ReasonCode.JUMP): float(steps[1].ratio.max(initial=0.0)),
             str(ReasonCode.PHOTOMETRIC): found.worst,
         }
-        scores |= camera_scores(system)
     if measured is not None:
         reasons += _measurements(rows, measured)
     return Verdict.of(reasons, scores)

@@ -12,13 +12,14 @@ import numpy as np
 import pytest
 
 from dualslam.backend import convert, schur
-from dualslam.backend.calibration_bundle import CorrectedLens
+from dualslam.backend.calibration_bundle import CorrectedLens, _HeldLens
 from dualslam.backend.point_refinement import huber
 from dualslam.backend.schur import Loss, System, geman_mcclure, optimise
 from dualslam.backend.solver import optimise_batch
 from dualslam.backend.ties import insert_projections, pose_prior
 from dualslam.core.bundle import BundleProblem
 from dualslam.core.errors import SolverError
+from dualslam.core.geometry import se3, so3
 from dualslam.testing.graph_scene import Feeder, make_scene, pose_errors
 
 SHAPE, ITERATIONS, TOLERANCE = 2.0, 20, 1e-9
@@ -152,9 +153,18 @@ def test_a_lens_is_found_with_poses_and_points() -> None:
         fixed=np.arange(len(scene.T_true)) == 0,
     )
     found = optimise(seen, partial(huber, k=SHAPE), 30, 1e-9, lens, np.zeros(5))
-    sigmas = np.sqrt(np.diag(System(seen, partial(huber, k=SHAPE), lens).lens_covariance(found.state)))
-    assert (np.abs(found.state.lens - true) < sigmas).all()
+    covariance, follows = System(seen, partial(huber, k=SHAPE), lens).about_lens(found.state)
+    assert (np.abs(found.state.lens - true) < np.sqrt(np.diag(covariance))).all()
     assert found.cost_after < 0.01 * found.cost_before
+    # Another lens, held, moves the poses as they follow it.
+    change = np.array([0.003, 0.5, -0.3, 0.002, 0.001])
+    held = _HeldLens(problem.K, found.state.lens + change)
+    moved = optimise(seen, partial(huber, k=SHAPE), 50, 1e-12, held, np.zeros(0)).state.T_submap_kf
+    expected = so3.log(se3.exp(follows @ change)[:, :3, :3])
+    turned = so3.log((se3.inverse(found.state.T_submap_kf) @ moved)[:, :3, :3])
+    size = float(np.linalg.norm(turned, axis=1).max())
+    assert size > 1e-5
+    np.testing.assert_allclose(turned, expected, atol=0.05 * size)
 
 
 def test_derivatives_of_the_lens() -> None:

@@ -17,12 +17,12 @@ from dualslam.core.config.calibration_config import CalibrationConfig
 from dualslam.core.config.settings import LinkingConfig
 from dualslam.core.estimates import PreferredCamera
 from dualslam.core.geometry import se3, sim3, so3
-from dualslam.core.types import Failure, FailureReason, IntArray
-from dualslam.linking import NO_BEND, Bend, LinkEstimate, check_camera, propagate_to_live_end
-from dualslam.linking.live_end import measure_bend
+from dualslam.core.types import FailureReason, IntArray
+from dualslam.linking import LinkEstimate, LinkRefusal, add_camera
+from dualslam.linking.live_end import Bend, measure_bend
 from dualslam.map.submap import Submap
 from tests.backend.test_self_calibration import TRUE, make_submap, wrong_camera
-from tests.linking.test_scale_observability import THERE, linked
+from tests.linking.test_scale_observability import linked
 
 CONFIG, CALIBRATION = LinkingConfig(), CalibrationConfig()
 N = 30
@@ -48,7 +48,7 @@ def found(
     bend = joint @ bend @ se3.inverse(joint)
     elsewhere = sim3.from_parts(1.7, so3.exp([0.4, -1.0, 0.2]), np.array([3.0, 1.0, -2.0]))
     moved = [sim3.act_on_pose(elsewhere @ bend if i > len(T) // 2 else elsewhere, T_k) for i, T_k in enumerate(T)]
-    return PreferredCamera(0.05, 0.01, 40.0, beyond_chance, ids, T, np.array(moved))
+    return PreferredCamera(0.05, 0.01, 40.0, beyond_chance, ids, T, np.array(moved), np.empty((0, *T.shape)))
 
 
 @pytest.mark.parametrize(("log_scale", "turn_deg"), [(0.0, 0.0), (0.03, 0.0), (-0.08, 2.0)])
@@ -63,31 +63,52 @@ def test_a_bend_is_by_what_one_end_turns_and_grows(log_scale: float, turn_deg: f
 
 def test_the_right_camera_bends_nothing(link: LinkEstimate) -> None:
     submap = make_submap(TRUE, turning=True, n=N)
-    bend = check_camera(submap, link, LIVE_SINCE, asking(TRUE), CONFIG)
-    assert isinstance(bend, Bend)
-    assert abs(bend.log_scale) < 0.005
+    carried = add_camera(link, submap, LIVE_SINCE, asking(TRUE), CONFIG)
+    assert isinstance(carried, LinkEstimate)
+    assert carried.numbers["sigma_scale_camera"] < 0.005
 
 
 def test_a_map_that_says_nothing_of_its_camera_has_no_bend(link: LinkEstimate) -> None:
     camera = wrong_camera(1.06)
     submap = make_submap(camera, turning=False, n=N)
-    assert check_camera(submap, link, LIVE_SINCE, asking(camera), CONFIG) == NO_BEND
+    assert add_camera(link, submap, LIVE_SINCE, asking(camera), CONFIG) is link
 
 
-def test_a_camera_that_bends_the_map_is_a_reason_for_no_link(link: LinkEstimate) -> None:
-    camera = wrong_camera(1.12)
+def bent_and_true(camera: PinholeCamera) -> tuple[Submap, Bend]:
+    """Return a map that a wrong camera has bent, and by how much."""
     true = make_submap(camera, turning=True, n=N)
     submap = true.copy()
     adjust_submap(submap, 1.345)
     ids = np.arange(N)
     poses = [m.keyframe_poses(ids) for m in (submap, true)]
-    truth = measure_bend(*poses, OVERLAP, np.arange(LIVE_SINCE, N))
+    return submap, measure_bend(*poses, OVERLAP, np.arange(LIVE_SINCE, N))
+
+
+def test_a_camera_that_bends_the_map_is_a_reason_for_no_link(link: LinkEstimate) -> None:
+    camera = wrong_camera(1.12)
+    submap, truth = bent_and_true(camera)
     assert abs(truth.log_scale) > CONFIG.max_live_scale_sigma, "else the scene shows nothing"
-    refused = check_camera(submap, link, LIVE_SINCE, asking(camera), CONFIG)
-    assert isinstance(refused, Failure)
+    refused = add_camera(link, submap, LIVE_SINCE, asking(camera), CONFIG)
+    assert isinstance(refused, LinkRefusal)
+    assert refused.unsure is None, "the scale would do for a doubt, but not the turn"
     assert refused.reason is FailureReason.CAMERA
-    assert refused.numbers["bend_scale"] == pytest.approx(truth.log_scale, rel=0.2)
+    assert refused.numbers["sigma_scale_camera"] == pytest.approx(abs(truth.log_scale), rel=0.2)
     assert "focal length -1" in refused.detail
+
+
+@pytest.mark.parametrize("log_focal", [0.01, 0.03])
+def test_a_camera_that_is_known_to_a_covariance_bends_the_map_as_one_that_is_so_far_off(
+    link: LinkEstimate, log_focal: float
+) -> None:
+    _, truth = bent_and_true(wrong_camera(math.exp(log_focal)))
+    submap, known = make_submap(TRUE, turning=True, n=N), np.diag([log_focal, 1e-6, 1e-6, 1e-9, 1e-9]) ** 2
+    find = partial(find_preferred_camera, camera=TRUE, config=CALIBRATION, present_covariance=known)
+    carried = add_camera(replace(link, sigma_scale=0.0), submap, LIVE_SINCE, find, CONFIG)
+    carried = carried.unsure if isinstance(carried, LinkRefusal) else carried
+    assert isinstance(carried, LinkEstimate)
+    assert carried.sigma_scale == pytest.approx(abs(truth.log_scale), rel=0.25, abs=0.002)
+    turned = math.sqrt((carried.covariance - link.covariance)[0, 0])
+    assert turned == pytest.approx(truth.rotation_rad, rel=0.25, abs=0.002)
 
 
 @pytest.mark.parametrize(
@@ -100,19 +121,20 @@ def test_what_counts_is_the_bend_and_not_the_contradiction(
     submap = make_submap(TRUE, turning=True, n=N)
     for beyond_chance, reason in ((True, FailureReason.CAMERA), (False, FailureReason.SCALE)):
         find = partial(found, log_scale=log_scale, turn_deg=turn_deg, beyond_chance=beyond_chance)
-        verdict = check_camera(submap, link, LIVE_SINCE, find, CONFIG)
-        assert isinstance(verdict, Bend) is passes
-        doubt = verdict.doubt if isinstance(verdict, Bend) else verdict
-        assert (doubt is None) is (abs(log_scale) < CONFIG.max_live_scale_sigma and turn_deg < 1.0)
-        assert doubt is None or doubt.reason is reason
+        verdict = add_camera(link, submap, LIVE_SINCE, find, CONFIG)
+        is_sure = abs(log_scale) < CONFIG.max_live_scale_sigma and turn_deg < 1.0
+        assert isinstance(verdict, LinkEstimate) is is_sure
+        if isinstance(verdict, LinkRefusal):
+            assert (verdict.unsure is not None) is passes
+            assert verdict.reason is reason
 
 
 def test_it_counts_beside_what_else_is_unknown(link: LinkEstimate) -> None:
     submap = make_submap(TRUE, turning=True, n=N)
     find = partial(found, log_scale=0.02, turn_deg=0.0)
     unsure = replace(link, sigma_scale=0.02)
-    bends = [check_camera(submap, each, LIVE_SINCE, find, CONFIG) for each in (link, unsure)]
-    assert [isinstance(bend, Bend) and bend.doubt is not None for bend in bends] == [False, True]
+    verdicts = [add_camera(each, submap, LIVE_SINCE, find, CONFIG) for each in (link, unsure)]
+    assert [isinstance(verdict, LinkEstimate) for verdict in verdicts] == [True, False]
 
 
 def test_of_a_large_map_a_window_is_asked_that_reaches_both_ends(
@@ -126,25 +148,22 @@ def test_of_a_large_map_a_window_is_asked_that_reaches_both_ends(
         return None
 
     submap = make_submap(TRUE, turning=True, n=N)
-    check_camera(submap, link, LIVE_SINCE, find, CONFIG)
+    add_camera(link, submap, LIVE_SINCE, find, CONFIG)
     assert len(asked[0]) == 12
     assert (asked[0][0], asked[0][-1]) == (0, N - 1)
     # Next to a live end of one keyframe those before it tell its scale.
-    assert isinstance(check_camera(submap, link, N - 1, find, CONFIG), Bend)
+    assert add_camera(link, submap, N - 1, find, CONFIG) is link
 
 
-def test_a_link_carries_it_in_its_covariance() -> None:
-    case, link = linked()
-    plain = propagate_to_live_end(link, case.new, int(THERE[0]), CONFIG)
-    bent = propagate_to_live_end(link, case.new, int(THERE[0]), CONFIG, Bend(0.015, math.radians(0.5)))
-    assert isinstance(plain, LinkEstimate)
+def test_a_link_carries_it_in_its_covariance(link: LinkEstimate) -> None:
+    submap = make_submap(TRUE, turning=True, n=N)
+    bent = add_camera(link, submap, LIVE_SINCE, partial(found, log_scale=0.015, turn_deg=0.5), CONFIG)
     assert isinstance(bent, LinkEstimate)
-    assert "sigma_scale_camera" not in plain.numbers
-    assert bent.numbers["sigma_scale"] == pytest.approx(math.hypot(plain.numbers["sigma_scale"], 0.015))
-    more = bent.covariance - plain.covariance
-    np.testing.assert_allclose(np.diag(more)[[0, 1, 2, 6]], [math.radians(0.5) ** 2] * 3 + [0.015**2], rtol=1e-6)
-    refused = propagate_to_live_end(link, case.new, int(THERE[0]), CONFIG, Bend(0.03))
-    assert isinstance(refused, Failure)
+    share = math.sqrt(1.0 - 1.0 / 40.0)
+    assert bent.numbers["sigma_scale"] == pytest.approx(math.hypot(link.sigma_scale, share * 0.015))
+    more = bent.covariance - link.covariance
+    sigmas = share * np.array([math.radians(0.5)] * 3 + [0.015])
+    np.testing.assert_allclose(np.diag(more)[[0, 1, 2, 6]], sigmas**2, rtol=1e-6)
 
 
 @pytest.mark.parametrize("seed", range(8))
@@ -172,6 +191,5 @@ def test_a_camera_within_one_sigma_bends_nothing(link: LinkEstimate) -> None:
         def find(submap: Submap, ids: IntArray, distance2: float = distance2) -> PreferredCamera:
             return replace(found(submap, ids, 0.04, 0.0, beyond_chance=False), distance2=distance2)
 
-        bend = check_camera(submap, link, LIVE_SINCE, find, CONFIG)
-        assert isinstance(bend, Bend)
-        assert (bend.doubt is None) is passes
+        verdict = add_camera(link, submap, LIVE_SINCE, find, CONFIG)
+        assert isinstance(verdict, LinkEstimate) is passes

@@ -13,7 +13,7 @@ from dualslam.core.geometry import so3
 from dualslam.core.noise_model import GROUP, UNSURE_SCALE
 from dualslam.map.submap import Submap
 from dualslam.run import claims as claims_module
-from dualslam.run.claims import claims_in_atlas, claims_of
+from dualslam.run.claims import Claim, claims_in_atlas
 from dualslam.run.results import frame_rows, trajectories_of
 from dualslam.system.system import System
 from dualslam.testing.point_world import PointWorld, cloud, hand_held, system_in
@@ -41,6 +41,13 @@ def without_ties(submap: Submap, border: int) -> Submap:
     both = np.intersect1d(landmarks[late], landmarks[~late])
     cut.remove_observations(alive[late & np.isin(landmarks, both)])
     return cut
+
+
+def claims_of(submap: Submap) -> dict[int, Claim]:
+    """Return what a submap claims of its keyframes by itself."""
+    atlas = Atlas()
+    atlas.add(submap)
+    return claims_in_atlas(atlas)[submap.id]
 
 
 def test_every_posed_frame_has_the_claim_of_its_keyframe() -> None:
