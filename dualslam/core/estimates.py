@@ -103,8 +103,8 @@ class PreferredCamera:
     - `keyframe_ids` (K,) int64.
     - `T_now`, `T_preferred` (K, 4, 4): their poses by the same pixels alone, under the current camera and the preferred
       one; each in a frame and unit of its own.
-    - `T_off` (N, K, 4, 4): from the preferred one by one standard deviation of the camera's own covariance, in each of
-      its independent directions; none where the camera is as it was given.
+    - `T_off` (N, K, 4, 4): those preferred, with the camera moved by one standard deviation of its own covariance, in
+      each independent direction. None if the camera is as it was given.
     """
 
     log_focal: float
