@@ -170,7 +170,7 @@ class Registrar(Protocol):
     """Poses frames in a finished submap, in any order, and extends it by them."""
 
     def densify(self) -> None:
-        """Triangulate what the submap's keyframes share, whether tracking needed it or not."""
+        """Match the submap's keyframes with those before them, whether tracking needed it or not."""
         ...
 
     def pose(self, view: View, keyframe_ids: Collection[int]) -> Track | Failure:
@@ -186,7 +186,7 @@ class Registrar(Protocol):
         ...
 
     def extend(self, keyframe_id: int, others: Collection[int]) -> None:
-        """Look for more landmarks of some keyframes in another, and triangulate new ones with them."""
+        """Carry landmarks on along a keyframe's matches with some others, and triangulate new ones with them."""
         ...
 
 

@@ -118,14 +118,16 @@ def seam_motions(old: Path, new: Path, slack: Slack = lambda i, j: 0.0) -> Itera
         yield motion
 
 
-def find_reached(path: Path, is_known: BoolArray, known: Path) -> BoolArray:
-    """Return the frames (N,) of a path to which steps that the camera can have made lead from known ones.
+def find_reached(path: Path, is_known: BoolArray, known: Path, sigma_mu: FloatArray) -> BoolArray:
+    """Return the frames (N,) of a path whose steps the camera can have made.
 
-    Steps from or to a frame that is not known are measured. The refused ones part the path: a part without a known
-    frame is not reached. The last known frames before a refused step may be corrupted, as in `seam_motions`.
+    Steps from or to a frame that is not known are measured. Beside a jump the frame that hangs more loosely on the
+    known ones is wrong. With it go those that follow, up to a known frame or the next jump. The last known frames
+    before a refused step may be corrupted, as in `seam_motions`.
 
     - `is_known` (N,): frames whose place is known.
     - `known`: the camera's path where the usual error is measured, in the unit of `path`.
+    - `sigma_mu` (N,): standard deviation of each frame's position against the known ones, 0 for these.
     """
     fits, usual, rows = _Fits.of(path), _Fits.of(known), np.arange(len(path))
 
@@ -136,9 +138,19 @@ def find_reached(path: Path, is_known: BoolArray, known: Path) -> BoolArray:
         without = _measure(_Fits.of(path.take(~tail)), i - int(tail.sum()), usual)
         return without is None or without.is_refused
 
-    torn = [is_torn(i) if not (is_known[i] and is_known[i + 1]) else False for i in range(len(path) - 1)]
-    part = np.concatenate([[0], np.cumsum(torn)])
-    return np.isin(part, part[is_known])
+    def excess(i: int) -> float:
+        """How far off a step is from either side alone: a jump beside it is in the velocity of one side only."""
+        sides = ((rows <= i + 1, i), (rows >= i, 0))
+        motions = [_measure(_Fits.of(path.take(side)), at, usual) for side, at in sides]
+        return min((m.off_mu / m.allowed_mu for m in motions if m is not None), default=math.inf)
+
+    torn = [i for i in rows[:-1].tolist() if not (is_known[i] and is_known[i + 1]) and is_torn(i)]
+    jumps, off = np.zeros(len(path) - 1, bool), np.array([excess(i) for i in torn])
+    for run in np.split(np.arange(len(torn)), np.flatnonzero(np.diff(torn) > 1) + 1) if torn else ():
+        jumps[np.array(torn)[run[(off[run] > 1.0) | (off[run] == off[run].max())]]] = True
+    part = np.concatenate([[0], np.cumsum(jumps | (is_known[:-1] != is_known[1:]))])
+    before = np.flatnonzero(jumps)
+    return ~np.isin(part, part[np.where(sigma_mu[before] > sigma_mu[before + 1], before, before + 1)])
 
 
 def join_slack(S_old_new: FloatArray, covariance: FloatArray, place: FloatArray) -> float:

@@ -12,7 +12,7 @@ landmarks, or a short way against their depth, fix how far the camera is from th
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -91,6 +91,26 @@ def relative_scales(
     between[~(cdist(g @ free, g @ free, "sqeuclidean") <= SLACK)] = np.inf
     np.fill_diagonal(between, 0.0)
     return between
+
+
+def position_sigmas(submap: Submap, held: Collection[int]) -> dict[int, float]:
+    """Return the standard deviation of each keyframe's position against some that are held, by all that it has seen.
+
+    Infinite where nothing ties it to them.
+    """
+    ids = np.array(sorted(submap.keyframes), np.int64)
+    problem = _linearise(_ask_all(submap, [(ids, ids)], dict.fromkeys(submap.keyframes, 1.0)))
+    free = ids[~np.isin(ids, list(held))]
+    sigma = dict.fromkeys(submap.keyframes, 0.0) | dict.fromkeys(free.tolist(), np.inf)
+    if problem is None or not len(free):
+        return sigma
+    rows = (6 * np.searchsorted(ids, free)[:, None] + np.arange(6)).ravel()
+    values, vectors = np.linalg.eigh(problem.reduced[np.ix_(rows, rows)])
+    by_place = vectors.reshape(len(free), 6, -1)[:, 3:]
+    stiff = values > NO_TIE * float(np.median(values))
+    variance = (by_place[:, :, stiff] ** 2 / values[stiff]).sum(axis=(1, 2))
+    tied = (by_place[:, :, ~stiff] ** 2).sum(axis=(1, 2)) <= SLACK
+    return sigma | dict(zip(free[tied].tolist(), np.sqrt(variance[tied]).tolist(), strict=True))
 
 
 def _ask_all(submap: Submap, places: Sequence[tuple[IntArray, IntArray]], excess: Mapping[int, float]) -> ScaleQuestion:

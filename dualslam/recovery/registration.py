@@ -29,7 +29,7 @@ ALIKE = 8
 """Keyframes that it resembles and is matched with."""
 MAX_SIGMA = 0.01
 """Of a position, relative to the depth of what is seen there."""
-EXPLAINED = 0.8
+EXPLAINED = 0.9
 """Share of the matched landmarks that a pose must explain, as far as these are known. One relative pose explains all
 matches of two images, so few are wrong. Where more disagree, the landmarks contradict each other."""
 ADJUSTED_WITH = 8

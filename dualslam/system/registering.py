@@ -18,6 +18,7 @@ from dualslam.core.memory import MB
 from dualslam.core.noise_model import MAX_TRIES, PROOF_VIEWS
 from dualslam.core.types import FailureReason, FrameMethod, FrameStatus, View
 from dualslam.linking.motion import find_reached
+from dualslam.linking.scale_observability import position_sigmas
 from dualslam.map.frame_observations import FrameObservations
 from dualslam.map.submap import Submap
 from dualslam.recovery.registration import REACH, Registration
@@ -169,7 +170,7 @@ class Registering:
         return [i for i in sorted(frames) if i in registered or self._shows_enough(submap, i)]
 
     def _unreached(self, before: Submap, grown: Submap, added: list[int]) -> set[int]:
-        """Return the registered frames to which no steps of the camera lead from the submap's own."""
+        """Return the registered frames that no steps of the camera join with the submap's own, by covisibility."""
         if not added:
             return set()
         taken = set(added)
@@ -177,7 +178,10 @@ class Registering:
         poses = [FramePose(k, grown.keyframes[k].timestamp_s, grown.id, k, np.eye(4)) for k in added]
         path = Path.of([*own, *poses], grown)
         known = ~np.isin(path.index, added)
-        reached = find_reached(path, known, path.take(known))
+        sigma = position_sigmas(grown, grown.keyframes.keys() - taken)
+        reached = find_reached(
+            path, known, path.take(known), np.array([sigma.get(i, 0.0) for i in path.index.tolist()])
+        )
         return set(path.index[~reached].tolist())
 
     def _enter(self, submap: Submap, added: list[int]) -> None:

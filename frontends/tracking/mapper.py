@@ -104,15 +104,6 @@ class Mapper:
         self._young.append((self._n_inserted, new))
         self._refresh_descriptions(view.index)
 
-    def extend(self, keyframe_id: int, others: list[int]) -> None:
-        """Grow the map between a keyframe and some others, all of which it holds; nothing is culled."""
-        submap = self._submap
-        self._search_neighbour_landmarks(keyframe_id, others, submap.landmark_of[keyframe_id])
-        candidates = np.ones(len(submap.landmark_of[keyframe_id]), bool)
-        new = [self._triangulate_pair(keyframe_id, other, candidates, MIN_PARALLAX_DEG) for other in others]
-        if new:
-            self._search_new_in_neighbours(np.concatenate(new), others)
-
     # --- steps
 
     def _neighbours(self, keyframe_id: int) -> list[int]:

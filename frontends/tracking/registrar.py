@@ -1,4 +1,8 @@
-"""Registration of single frames in a finished map: a pose by all keyframes that a frame resembles, together."""
+"""Registration of single frames in a finished map: a pose by all keyframes that a frame resembles, together.
+
+Landmarks come from matches of whole images alone, as far as one relative pose explains them. A search near where the
+poses expect a point always finds something that confirms them, and where steps are wide it is often another thing.
+"""
 
 from __future__ import annotations
 
@@ -7,24 +11,25 @@ from collections.abc import Collection
 import numpy as np
 
 from dualslam.core.camera.base import Camera
-from dualslam.core.chi_square import CHI2_99, squared_distances
+from dualslam.core.chi_square import CHI2_95, CHI2_99, squared_distances
 from dualslam.core.config.settings import Config
 from dualslam.core.firsts import is_first
 from dualslam.core.geometry import se3
 from dualslam.core.geometry.projection import project_points
+from dualslam.core.geometry.triangulation import in_front, triangulate_two_view
 from dualslam.core.geometry.two_view import fundamental_from_pose, sampson_error
 from dualslam.core.interfaces import Frontend
 from dualslam.core.noise_model import MIN_CONSENSUS, PROOF_VIEWS
 from dualslam.core.types import BoolArray, Failure, FailureReason, Features, FloatArray, IntArray, Keyframe, Track, View
 from dualslam.frontends.gap.second_pose import refuse_second_pose
-from dualslam.frontends.tracking.mapper import Mapper
+from dualslam.frontends.tracking.mapper import MIN_PARALLAX_DEG
 from dualslam.frontends.tracking.resection import estimate_pose
 from dualslam.frontends.tracking.two_view_hypotheses import estimate_relative_pose
 from dualslam.map.landmark_views import landmark_covariances, pixel_covariances
 from dualslam.map.submap import NO_LANDMARK, Submap
 
 BEFORE = 4
-"""Keyframes before each one that the map is triangulated again with."""
+"""Keyframes before each one that it is matched with again."""
 
 
 class Registrar:
@@ -36,14 +41,13 @@ class Registrar:
 
     def __init__(self, frontend: Frontend, config: Config, submap: Submap, camera: Camera) -> None:
         self._frontend, self._config, self._submap, self._camera = frontend, config, submap, camera
-        self._mapper = Mapper(frontend, config.mapping, submap, camera)
         self._matches: dict[tuple[int, int], IntArray] = {}
 
     def densify(self) -> None:
-        """Triangulate what the submap's keyframes share with those before them, whether tracking needed it or not."""
+        """Match the submap's keyframes with those before them, whether tracking needed it or not."""
         ids = sorted(self._submap.keyframes)
         for n, k in enumerate(ids):
-            self._mapper.extend(k, ids[max(n - BEFORE, 0) : n][::-1])
+            self.extend(k, ids[max(n - BEFORE, 0) : n][::-1])
 
     def pose(self, view: View, keyframe_ids: Collection[int]) -> Track | Failure:
         """Pose a frame by the landmarks of some keyframes that three views prove.
@@ -102,15 +106,63 @@ class Registrar:
         self._submap.add_observations(view.index, feature, track.landmark_ids[feature])
 
     def extend(self, keyframe_id: int, others: Collection[int]) -> None:
-        """Look for more of the landmarks of some keyframes in another, and triangulate new ones with them."""
-        self._mapper.extend(keyframe_id, list(others))
+        """Carry landmarks on along a keyframe's matches with some others, merge those that are one, make new ones."""
+        keyframe = self._submap.keyframes[keyframe_id]
+        view = View(keyframe_id, keyframe.timestamp_s, keyframe.features)
+        for other in others:
+            in_other, in_keyframe = self._matched(other, view).T
+            self._carry_on(other, in_other, keyframe_id, in_keyframe)
+            self._carry_on(keyframe_id, in_keyframe, other, in_other)
+            self._merge(keyframe_id, in_keyframe, other, in_other)
+            self._triangulate(keyframe_id, in_keyframe, other, in_other)
 
     # --- steps
 
+    def _carry_on(self, a: int, in_a: IntArray, b: int, in_b: IntArray) -> None:
+        """Let a keyframe b see the landmarks of another, a, at the features that match there and have none."""
+        submap = self._submap
+        landmark = submap.landmark_of[a][in_a]
+        new = (landmark != NO_LANDMARK) & (submap.landmark_of[b][in_b] == NO_LANDMARK)
+        new &= ~np.isin(landmark, submap.landmark_of[b])
+        new[new] = self._appear_at(landmark[new], b, in_b[new])
+        submap.add_observations(b, in_b[new], landmark[new])
+
+    def _merge(self, a: int, in_a: IntArray, b: int, in_b: IntArray) -> None:
+        """Make matched landmarks one where each appears at the other's feature, towards that with more views."""
+        of_a, of_b = self._submap.landmark_of[a][in_a], self._submap.landmark_of[b][in_b]
+        two = (of_a != NO_LANDMARK) & (of_b != NO_LANDMARK) & (of_a != of_b)
+        two[two] = self._appear_at(of_a[two], b, in_b[two]) & self._appear_at(of_b[two], a, in_a[two])
+        n_of_a, n_of_b = self._submap.n_observations(np.stack([of_a[two], of_b[two]]))
+        swap, pair = n_of_b > n_of_a, np.stack([of_a[two], of_b[two]])
+        self._submap.merge_landmarks(np.where(swap, pair[1], pair[0]), np.where(swap, pair[0], pair[1]))
+
+    def _triangulate(self, a: int, in_a: IntArray, b: int, in_b: IntArray) -> None:
+        """Make landmarks of matched features of which neither has one."""
+        submap = self._submap
+        free = (submap.landmark_of[a][in_a] == NO_LANDMARK) & (submap.landmark_of[b][in_b] == NO_LANDMARK)
+        in_a, in_b = in_a[free], in_b[free]
+        here, there = submap.keyframes[a].features.take(in_a), submap.keyframes[b].features.take(in_b)
+        T_submap_a, T_submap_b = submap.T_submap_kf[a], submap.T_submap_kf[b]
+        points = triangulate_two_view(here.uv_rect_px, there.uv_rect_px, submap.K, T_submap_a, T_submap_b)
+        good = in_front(points.depth_a, points.depth_b)
+        good &= points.cos_parallax < np.cos(np.radians(MIN_PARALLAX_DEG))
+        good &= points.error2_a < CHI2_95[2] * here.sigma_px**2
+        good &= points.error2_b < CHI2_95[2] * there.sigma_px**2
+        ids = submap.add_landmarks(points.xyz[good], here.descriptors[good], here.scale[good], a)
+        submap.add_observations(a, in_a[good], ids)
+        submap.add_observations(b, in_b[good], ids)
+
+    def _appear_at(self, landmark_ids: IntArray, keyframe_id: int, feature: IntArray) -> BoolArray:
+        """Return which landmarks (N,) a keyframe's pose shows at these of its features."""
+        submap, features = self._submap, self._submap.keyframes[keyframe_id].features.take(feature)
+        T_kf_submap = se3.inverse(submap.T_submap_kf[keyframe_id])
+        uv, depth = project_points(submap.K, T_kf_submap, submap.landmarks["xyz_mu"][landmark_ids])
+        off2 = ((uv - features.uv_rect_px) ** 2).sum(axis=1)
+        return np.asarray((depth > 0) & (off2 < CHI2_95[2] * features.sigma_px**2))
+
     def _landmarks_of(self, view: View, keyframe_id: int) -> IntArray:
         """Return (N, 2) features of a frame, and the landmarks of a keyframe that they match."""
-        keyframe = self._submap.keyframes[keyframe_id]
-        in_keyframe, in_view = self._matched(keyframe_id, keyframe.features, view).T
+        in_keyframe, in_view = self._matched(keyframe_id, view).T
         landmark = self._submap.landmark_of[keyframe_id][in_keyframe]
         seen = (landmark != NO_LANDMARK) & (self._submap.n_observations(landmark) >= PROOF_VIEWS)
         return np.column_stack((in_view[seen], landmark[seen]))
@@ -126,9 +178,9 @@ class Registrar:
         off2[known] = squared_distances((uv - features.uv_rect_px)[known], spread[known])
         return np.asarray(known & (off2 < CHI2_99[2]))
 
-    def _matched(self, keyframe_id: int, features: Features, view: View) -> IntArray:
+    def _matched(self, keyframe_id: int, view: View) -> IntArray:
         """Return (N, 2) features of a keyframe and a frame that match, if one relative pose explains them."""
-        key = keyframe_id, view.index
+        key, features = (keyframe_id, view.index), self._submap.keyframes[keyframe_id].features
         if key not in self._matches:
             pairs = self._frontend.match_wide(features, view.features).index
             if len(pairs) >= MIN_CONSENSUS:

@@ -24,7 +24,12 @@ from dualslam.linking.estimate import LinkRefusal
 from dualslam.linking.gates import MIN_TIES, MINORITY_DEFORMATION
 from dualslam.linking.join_test import LinkEvidence
 from dualslam.linking.pairs import PairModel
-from dualslam.linking.scale_observability import relative_scales, scale_sigma_between, scale_sigmas_in_all
+from dualslam.linking.scale_observability import (
+    position_sigmas,
+    relative_scales,
+    scale_sigma_between,
+    scale_sigmas_in_all,
+)
 from dualslam.linking.verify import judge_parting
 from dualslam.map.solving import solve
 from dualslam.map.submap import Submap
@@ -120,6 +125,16 @@ def test_fewer_ties_hold_less_and_none_hold_nothing() -> None:
     assert sigmas[2] > 2 * sigmas[0]
     assert sigmas[3] == np.inf
     assert scale_sigma_between(submap, HERE, np.array([10_000])) == np.inf
+
+
+def test_a_position_is_the_less_sure_the_fewer_landmarks_tie_it_to_what_is_held() -> None:
+    _, submap = solved("street", 0)
+    ids = sorted(submap.keyframes)
+    whole, few, none = (position_sigmas(thinned(submap, 12 * FRAME_STEP, n), ids[:6]) for n in (1000, 12, 0))
+    assert {whole[k] for k in ids[:6]} == {0.0}
+    assert 0 < whole[ids[6]] < whole[ids[11]] < whole[ids[-1]] < few[ids[-1]] / 2
+    assert few[ids[8]] < 1.5 * whole[ids[8]]
+    assert none[ids[-1]] == np.inf
 
 
 def test_the_unit_does_not_matter() -> None:

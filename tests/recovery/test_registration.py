@@ -21,8 +21,8 @@ from dualslam.testing.point_world import CAMERA, PointWorld, cloud, hand_held, p
 POSITION_M, ROTATION_RAD = 0.03, 0.005
 
 
-def true_map(world: PointWorld, keyframes: Iterable[int]) -> Submap:
-    """Return a submap in world coordinates, with every point that two keyframes see."""
+def true_map(world: PointWorld, keyframes: Iterable[int], n_points: int | None = None) -> Submap:
+    """Return a submap in world coordinates, with every point, of the first so many, that two keyframes see."""
     submap, views = Submap(0, CAMERA.K, np.zeros(32, np.uint8)), {k: world.view(k) for k in keyframes}
     ids = np.full(len(world.xyz), NO_LANDMARK)
     point_of = {
@@ -30,6 +30,7 @@ def true_map(world: PointWorld, keyframes: Iterable[int]) -> Submap:
         for k, view in views.items()
     }
     n_seen = np.bincount(np.concatenate(list(point_of.values())), minlength=len(world.xyz))
+    n_seen[len(n_seen) if n_points is None else n_points :] = 0
     for k, view in views.items():
         submap.add_keyframe(Keyframe(k, view.timestamp_s, view.features), world.T_world_cam[k])
         points, features = point_of[k], view.features
@@ -80,6 +81,19 @@ def test_frames_of_something_else_leave_the_map_as_it_was() -> None:
     assert registered(world, submap, range(20, 24)) == []
     assert submap.keyframes.keys() == before.keyframes.keys()
     np.testing.assert_array_equal(submap.landmarks["xyz_mu"], before.landmarks["xyz_mu"])
+
+
+def test_like_bars_do_not_confirm_a_wrong_pose() -> None:
+    """Near where one bar is expected another one is found; matches of whole images show none."""
+    rng, n_bars = np.random.default_rng(3), 240
+    fence = np.column_stack([np.linspace(-6, 6, n_bars), rng.uniform(-1.5, 1.5, n_bars), np.full(n_bars, 5.0)])
+    world = PointWorld(np.concatenate([cloud(200), fence]), hand_held(60))
+    world.descriptors[200:] = world.descriptors[200 + np.arange(n_bars) % 6]
+    submap = true_map(world, [0, 10, 20], 200)
+    wrong = world.T_world_cam[30] @ se3.exp(np.array([0.0, 0.02, 0.0, 0.3, 0.1, 0.0]))
+    submap.add_keyframe(Keyframe(30, world.view(30).timestamp_s, world.features(30)), wrong)
+    Registrar(OrbFrontend(), Config(), submap, CAMERA).extend(30, [0, 10, 20])
+    assert len(submap.seen_in(30)) < 10
 
 
 def test_a_turn_in_place_leads_no_farther_than_the_points_that_were_seen_from_two_places() -> None:
