@@ -29,9 +29,11 @@ two dimensions tell, about as much as Huber's at 1.345 (93 %); at 2 it is 75 %."
 LEAST_NOISE = 0.05
 """Standard deviation that residuals have at least, in the pixels' sigmas: those of made-up pixels vanish."""
 ITERATIONS = 3
+WIDER = (16.0, 4.0)
+"""Times as wide as the loss is at first where landmarks were made one: their places differ by tens of pixels."""
 
 
-def refine_submap(submap: Submap, robust_k: float, frames: FrameRows | None = None) -> float:
+def refine_submap(submap: Submap, robust_k: float, frames: FrameRows | None = None, tied: bool = False) -> float:
     """Refine all keyframes and landmarks of a submap, in place.
 
     Its first keyframe stays where it is, and the mean square distance of the others from it stays what it is.
@@ -39,6 +41,7 @@ def refine_submap(submap: Submap, robust_k: float, frames: FrameRows | None = No
     - `robust_k`: Huber threshold in sigmas, for landmarks whose depth is too uncertain to take part: they follow the
       poses.
     - `frames`: what frames that are no keyframes have seen: more views of the same landmarks.
+    - `tied`: landmarks were made one that the map had in different places.
 
     Returns float: shape of the loss, in the pixels' sigmas; `FORGETS_AT` where there is one keyframe.
 
@@ -49,8 +52,9 @@ def refine_submap(submap: Submap, robust_k: float, frames: FrameRows | None = No
         return FORGETS_AT
     shape, centre = FORGETS_AT * _residual_sigma(submap), submap.T_submap_kf[first][:3, 3]
     refined, seen = submap.copy(), submap.landmarks_of_keyframes([first, *others])
-    for landmarks in (_best_seen(submap), seen):
-        bundle = bundle_adjust(refined, others, [first], shape, ITERATIONS, True, frames, landmarks)
+    passes = [(wider * shape, seen) for wider in WIDER if tied]
+    for width, landmarks in (*passes, (shape, _best_seen(submap)), (shape, seen)):
+        bundle = bundle_adjust(refined, others, [first], width, ITERATIONS, True, frames, landmarks)
         refined.apply_estimate(*bundle.estimate)
         if frames is not None:
             frames = replace(frames, T_submap_cam=bundle.T_submap_frame)

@@ -36,7 +36,7 @@ STAGES = {
     "calibration": ("calibration", "calibration (beside)"),
     "walks": ("walk back", "merging"),
     "starts": ("initialisation", "shutter"),
-    "at the end": ("final refinement",),
+    "at the end": ("final refinement", "ties"),
 }
 """Columns of the table of stages, and what they hold; the graph, which is part of mapping, is taken out of it."""
 GRAPH = "graph (in mapping)"

@@ -185,6 +185,10 @@ class Registrar(Protocol):
         """Make a frame a keyframe of the submap that sees the landmarks by which it was posed."""
         ...
 
+    def tie(self, alike: Mapping[int, list[int]]) -> int:
+        """Let keyframes that resemble each other share the landmarks that both show; return how many features do."""
+        ...
+
     def extend(self, keyframe_id: int, others: Collection[int]) -> None:
         """Carry landmarks on along a keyframe's matches with some others, and triangulate new ones with them."""
         ...
@@ -243,8 +247,11 @@ class FinalRefiner(Protocol):
     Raises `SolverError`, and leaves the submap as it was, where the solver fails.
     """
 
-    def __call__(self, submap: Submap, *, frames: FrameRows) -> float:
-        """Refine by keyframes and frames, and return the shape of that loss, in the pixels' sigmas."""
+    def __call__(self, submap: Submap, *, frames: FrameRows, tied: bool) -> float:
+        """Refine by keyframes and frames, and return the shape of that loss, in the pixels' sigmas.
+
+        `tied`: landmarks were made one that the map had in different places.
+        """
         ...
 
 

@@ -37,6 +37,7 @@ class Registering:
         self._state, self._connections = state, connections
         self._kept: dict[int, View] = {}
         self._nbytes = 0
+        self.tied: set[int] = set()  # submaps whose keyframes share more landmarks now
 
     def note(self, view: View) -> None:
         """Keep a frame that has no pose, without its image; as many of them as the frame buffer may hold."""
@@ -48,10 +49,25 @@ class Registering:
             self._nbytes += view.features.nbytes
 
     def finish(self, now: FrameStamp) -> None:
-        """Register frames in the submaps of the main map, the one with most frames first."""
+        """Register frames in the submaps of the main map, the one with most frames first; tie what shows the same."""
+        if self._state.record.poses and not self._has_repeated():
+            self._register_outside(now)
+            self._tie()
+
+    # --- steps
+
+    def _tie(self) -> None:
+        """Let keyframes of a submap that show the same share its landmarks: each map is refined by these ties."""
+        record, parts = self._state.record, self._state.parts
+        with record.timer.measure("ties"):
+            for m, submap in record.atlas.submaps.items():
+                images = {k: keyframe.features for k, keyframe in submap.keyframes.items()}
+                if n := parts.new_registrar(submap).tie(parts.alike(images, images.keys(), REACH + 1)):
+                    self.tied.add(m)
+                    log.info("submap %d: %d pairs of features show one landmark", m, n)
+
+    def _register_outside(self, now: FrameStamp) -> None:
         atlas, record = self._state.record.atlas, self._state.record
-        if not record.poses or self._has_repeated():
-            return
         count = Counter(pose.submap_id for pose in record.own_poses())
         main = atlas.largest(count + self._shown_under_a_better_camera())
         with record.timer.measure("registration"):
@@ -66,8 +82,6 @@ class Registering:
             for m in [largest] if whole else [largest, *rest]:
                 self._register(atlas.submaps[m], views, alike, now)
                 views = {i: view for i, view in views.items() if i not in atlas.submaps[m].keyframes}
-
-    # --- steps
 
     def _has_repeated(self) -> bool:
         """Whether a pose or a join was refused in this run because the scene repeats itself, or by the camera's motion.

@@ -330,7 +330,7 @@ class System:
             self._places.join_rest(self.atlas.submaps.keys() - self._earlier, last)
             if self._registers:
                 self._registering.finish(last)
-        shapes = {} if interrupted or state.localises else self._endings.refine()
+        shapes = {} if interrupted or state.localises else self._endings.refine(self._registering.tied)
         if last is not None:
             self._connections.settle(last)
             self._endings.pose_frames_anew(shapes)

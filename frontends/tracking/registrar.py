@@ -6,7 +6,7 @@ poses expect a point always finds something that confirms them, and where steps 
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 
 import numpy as np
 
@@ -22,12 +22,16 @@ from dualslam.core.interfaces import Frontend
 from dualslam.core.noise_model import MIN_CONSENSUS, PROOF_VIEWS
 from dualslam.core.types import BoolArray, Failure, FailureReason, Features, FloatArray, IntArray, Keyframe, Track, View
 from dualslam.frontends.gap.second_pose import refuse_second_pose
+from dualslam.frontends.tracking.local_map import LocalMap
 from dualslam.frontends.tracking.mapper import MIN_PARALLAX_DEG
 from dualslam.frontends.tracking.resection import estimate_pose
+from dualslam.frontends.tracking.shared_landmarks import share_landmarks
 from dualslam.frontends.tracking.two_view_hypotheses import estimate_relative_pose
 from dualslam.map.landmark_views import landmark_covariances, pixel_covariances
 from dualslam.map.submap import NO_LANDMARK, Submap
 
+APART_S = 2.0
+"""Seconds between keyframes from which on one comes back to what the other has seen; before, tracking ties them."""
 BEFORE = 4
 """Keyframes before each one that it is matched with again."""
 
@@ -105,6 +109,19 @@ class Registrar:
         )
         self._submap.add_observations(view.index, feature, track.landmark_ids[feature])
 
+    def tie(self, alike: Mapping[int, list[int]]) -> int:
+        """Let keyframes that resemble each other share the landmarks that both show, where they share few.
+
+        A part of a map that lies askew is not found again where tracking looks for it, and is mapped once more.
+
+        Returns int: how many pairs of features have come to see one landmark.
+        """
+        matches = []
+        for a, b in self._sharing_too_little(alike):
+            keyframe = self._submap.keyframes[b]
+            matches.append((a, b, self._matched(a, View(b, keyframe.timestamp_s, keyframe.features))))
+        return share_landmarks(self._submap, matches)
+
     def extend(self, keyframe_id: int, others: Collection[int]) -> None:
         """Carry landmarks on along a keyframe's matches with some others, merge those that are one, make new ones."""
         keyframe = self._submap.keyframes[keyframe_id]
@@ -159,6 +176,30 @@ class Registrar:
         uv, depth = project_points(submap.K, T_kf_submap, submap.landmarks["xyz_mu"][landmark_ids])
         off2 = ((uv - features.uv_rect_px) ** 2).sum(axis=1)
         return np.asarray((depth > 0) & (off2 < CHI2_95[2] * features.sigma_px**2))
+
+    def _sharing_too_little(self, alike: Mapping[int, list[int]]) -> list[tuple[int, int]]:
+        """Return the pairs that by the map's own places see enough of the same to be tracked by, and share less."""
+        submap, ids, enough = self._submap, sorted(self._submap.keyframes), self._config.keyframes.weak_landmarks
+        local = LocalMap.of_keyframes(submap, ids)
+        seen = {k: submap.mask_of(submap.landmark_of[k])[local.landmark_ids] for k in ids}
+        shown = {k: self._shown_in(k, local) for k in ids}
+        times_s = {k: submap.keyframes[k].timestamp_s for k in ids}
+        pairs = sorted({(min(a, b), max(a, b)) for a in ids for b in alike.get(a, ())})
+        return [
+            (a, b)
+            for a, b in pairs
+            if times_s[b] - times_s[a] > APART_S
+            and np.count_nonzero(seen[a] & seen[b]) < enough
+            and min(np.count_nonzero(shown[a] & seen[b]), np.count_nonzero(shown[b] & seen[a])) >= enough
+        ]
+
+    def _shown_in(self, keyframe_id: int, local: LocalMap) -> BoolArray:
+        """Return which landmarks (N,) a keyframe should see."""
+        T_cam_submap, pyramid = se3.inverse(self._submap.T_submap_kf[keyframe_id]), self._frontend
+        camera = self._submap.K, self._camera
+        shown = np.zeros(len(local), bool)
+        shown[local.predict(T_cam_submap, *camera, pyramid.scale_factor, pyramid.n_octaves).rows] = True
+        return shown
 
     def _landmarks_of(self, view: View, keyframe_id: int) -> IntArray:
         """Return (N, 2) features of a frame, and the landmarks of a keyframe that they match."""
