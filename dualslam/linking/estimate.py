@@ -11,8 +11,7 @@ refinement they would count twice.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.random import Generator
@@ -166,77 +165,38 @@ def estimate_link(
             return LinkRefusal(FailureReason.DEFORMED, detail, numbers, torn_at, walk_sigma=np.inf)
     if np.count_nonzero(trusted) < config.min_keyframes:
         return _needs_older(int(np.count_nonzero(trusted)), config, onset)
-    # 3. All of them, or the parts of a long overlap on which both maps have the same shape.
-    overlap = _Overlap(old, new, matched, pairs, onset, config)
-    refused = link = _link_over(overlap, pairs.keyframes[trusted], rng)
-    for before in _parts(pairs.keyframes[trusted], config) if _is_bent(refused) else ():
-        link = _link_over(overlap, before, rng)
-        if link:
-            return link
-    return refused
+    # 3. What they agree on.
+    return _link_over(old, new, matched, pairs, pairs.keyframes[trusted], onset, config, rng)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Overlap:
-    """Both maps' data of their shared frames. `onset`: keyframes from there on are not trusted."""
+def _link_over(
+    old: Submap,
+    new: Submap,
+    matched: MatchedLandmarks,
+    all_pairs: Correspondences,
+    trusted: IntArray,
+    onset: int | None,
+    config: LinkingConfig,
+    rng: Generator,
+) -> LinkEstimate | Failure:
+    """Estimate the link on the trusted keyframes (ids), and pass it through the gates.
 
-    old: Submap
-    new: Submap
-    matched: MatchedLandmarks
-    pairs: Correspondences
-    onset: int | None
-    config: LinkingConfig
-    _by_limit: dict[int, Correspondences] = field(default_factory=dict)
-
-    def pairs_before(self, limit: int | None) -> Correspondences:
-        """Return the pairs with the old map's points placed by keyframes before `limit` alone; asked for many times."""
-        if limit is None:
-            return self.pairs
-        if limit not in self._by_limit:
-            self._by_limit[limit] = place_pairs(self.old, self.new, self.matched, limit)
-        return self._by_limit[limit]
-
-
-def _is_bent(refused: LinkEstimate | Failure) -> bool:
-    """Whether an overlap was refused because the two maps differ in shape there: parts of it may not."""
-    reasons = (FailureReason.SCALE, FailureReason.DEGENERATE, FailureReason.DEFORMED)
-    return isinstance(refused, Failure) and refused.reason in reasons
-
-
-def _parts(keyframes: IntArray, config: LinkingConfig) -> Iterator[IntArray]:
-    """Yield runs of neighbouring keyframes: the longer ones and of these the older ones first.
-
-    None is shorter than twice what a link must stand on: of many short ones some pass by chance.
+    - `all_pairs`: placed by all of the old map.
+    - `onset`: keyframes from there on are not trusted.
     """
-    for share in (2, 3):
-        n = len(keyframes) // share
-        if n < 2 * config.min_keyframes:
-            return
-        for start in range(0, len(keyframes) - n + 1, (n + 2) // 3):
-            yield keyframes[start : start + n]
-
-
-def _link_over(overlap: _Overlap, before: IntArray, rng: Generator) -> LinkEstimate | Failure:
-    """Estimate the link on some of the trusted keyframes, `before` (ids), and pass it through the gates."""
-    old, new, config, onset = overlap.old, overlap.new, overlap.config, overlap.onset
-    oldest = before[0]
     # The similarity on which the oldest of them agree, and how far it holds. What lies beyond has moved landmarks of
     # the healthy part too: place those anew without it, and ask again.
-    all_pairs = overlap.pairs
     limit = onset
     while True:
-        pairs = overlap.pairs_before(limit)
+        pairs = all_pairs if limit is None else place_pairs(old, new, matched, limit)
         model = PairModel(pairs, old, new, config.deformation_sigma)
         can_vote = pairs.count_by_keyframe(np.ones(len(pairs.view_pair), bool)) >= MIN_PAIRS_PER_KEYFRAME
-        consensus = _oldest_consensus(model, can_vote & np.isin(pairs.keyframes, before), config, rng, limit)
+        consensus = _oldest_consensus(model, can_vote & np.isin(pairs.keyframes, trusted), config, rng, limit)
         if isinstance(consensus, Failure):
             return consensus
         if consensus.change is None:
             break
-        limit, before = consensus.change, before[before < consensus.change]
-    contradicted = ~consensus.votes.agrees[can_vote & (pairs.keyframes < oldest)]
-    if np.count_nonzero(contradicted) > MAX_MISFITS:
-        return Failure(FailureReason.AGREEMENT, f"{np.count_nonzero(contradicted)} older keyframes disagree")
+        limit, trusted = consensus.change, trusted[trusted < consensus.change]
     # Newer keyframes that nothing speaks against, and that part with it all the same: enough of them for another link.
     whole = PairModel(all_pairs, old, new, config.deformation_sigma)
     later = ask_keyframes(whole, consensus.estimate.S_dst_src, config)

@@ -240,6 +240,7 @@ class TestPreferredCamera:
         unsure = np.diag([0.02, 5.0, 5.0, 0.02, 0.02]) ** 2
         found = [find_preferred_camera(submap, ids, camera, CONFIG, present_covariance=P) for P in (None, unsure)]
         assert [each.beyond_chance for each in found if each] == [True, False]
+        assert [len(each.T_off) for each in found if each] == [0, 5]
 
     def test_a_map_that_does_not_turn_says_nothing(self) -> None:
         camera = wrong_camera(1.06)
