@@ -185,8 +185,11 @@ class Registrar(Protocol):
         """Make a frame a keyframe of the submap that sees the landmarks by which it was posed."""
         ...
 
-    def tie(self, alike: Mapping[int, list[int]]) -> int:
-        """Let keyframes that resemble each other share the landmarks that both show; return how many features do."""
+    def tie(self, find_alike: Callable[[Collection[int]], Mapping[int, list[int]]]) -> int:
+        """Let keyframes that resemble each other share the landmarks that both show; return how many features do.
+
+        `find_alike`: asks which keyframes each of some resembles.
+        """
         ...
 
     def extend(self, keyframe_id: int, others: Collection[int]) -> None:

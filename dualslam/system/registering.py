@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -58,13 +58,20 @@ class Registering:
 
     def _tie(self) -> None:
         """Let keyframes of a submap that show the same share its landmarks: each map is refined by these ties."""
-        record, parts = self._state.record, self._state.parts
+        record = self._state.record
         with record.timer.measure("ties"):
             for m, submap in record.atlas.submaps.items():
-                images = {k: keyframe.features for k, keyframe in submap.keyframes.items()}
-                if n := parts.new_registrar(submap).tie(parts.alike(images, images.keys(), REACH + 1)):
+                if n := self._tie_within(submap):
                     self.tied.add(m)
                     log.info("submap %d: %d pairs of features show one landmark", m, n)
+
+    def _tie_within(self, submap: Submap) -> int:
+        images, parts = {k: keyframe.features for k, keyframe in submap.keyframes.items()}, self._state.parts
+
+        def find_alike(ids: Collection[int]) -> dict[int, list[int]]:
+            return parts.alike(images, ids, REACH + 1)
+
+        return parts.new_registrar(submap).tie(find_alike)
 
     def _register_outside(self, now: FrameStamp) -> None:
         atlas, record = self._state.record.atlas, self._state.record

@@ -6,9 +6,10 @@ poses expect a point always finds something that confirms them, and where steps 
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
 
 import numpy as np
+from scipy.sparse import csr_array
 
 from dualslam.core.camera.base import Camera
 from dualslam.core.chi_square import CHI2_95, CHI2_99, squared_distances
@@ -109,17 +110,23 @@ class Registrar:
         )
         self._submap.add_observations(view.index, feature, track.landmark_ids[feature])
 
-    def tie(self, alike: Mapping[int, list[int]]) -> int:
+    def tie(self, find_alike: Callable[[Collection[int]], Mapping[int, list[int]]]) -> int:
         """Let keyframes that resemble each other share the landmarks that both show, where they share few.
 
         A part of a map that lies askew is not found again where tracking looks for it, and is mapped once more.
 
+        `find_alike`: asks which keyframes each of some resembles.
+
         Returns int: how many pairs of features have come to see one landmark.
         """
-        matches = []
-        for a, b in self._sharing_too_little(alike):
-            keyframe = self._submap.keyframes[b]
-            matches.append((a, b, self._matched(a, View(b, keyframe.timestamp_s, keyframe.features))))
+        pairs = self._sharing_too_little()
+        if not len(pairs):
+            return 0
+        alike, matches = find_alike(np.unique(pairs).tolist()), []
+        for a, b in pairs.tolist():
+            if b in alike.get(a, ()) or a in alike.get(b, ()):
+                keyframe = self._submap.keyframes[b]
+                matches.append((a, b, self._matched(a, View(b, keyframe.timestamp_s, keyframe.features))))
         return share_landmarks(self._submap, matches)
 
     def extend(self, keyframe_id: int, others: Collection[int]) -> None:
@@ -177,29 +184,26 @@ class Registrar:
         off2 = ((uv - features.uv_rect_px) ** 2).sum(axis=1)
         return np.asarray((depth > 0) & (off2 < CHI2_95[2] * features.sigma_px**2))
 
-    def _sharing_too_little(self, alike: Mapping[int, list[int]]) -> list[tuple[int, int]]:
-        """Return the pairs that by the map's own places see enough of the same to be tracked by, and share less."""
-        submap, ids, enough = self._submap, sorted(self._submap.keyframes), self._config.keyframes.weak_landmarks
-        local = LocalMap.of_keyframes(submap, ids)
-        seen = {k: submap.mask_of(submap.landmark_of[k])[local.landmark_ids] for k in ids}
-        shown = {k: self._shown_in(k, local) for k in ids}
-        times_s = {k: submap.keyframes[k].timestamp_s for k in ids}
-        pairs = sorted({(min(a, b), max(a, b)) for a in ids for b in alike.get(a, ())})
-        return [
-            (a, b)
-            for a, b in pairs
-            if times_s[b] - times_s[a] > APART_S
-            and np.count_nonzero(seen[a] & seen[b]) < enough
-            and min(np.count_nonzero(shown[a] & seen[b]), np.count_nonzero(shown[b] & seen[a])) >= enough
-        ]
+    def _sharing_too_little(self) -> IntArray:
+        """Return the pairs (N, 2) that by the map's own places see enough of the same to be tracked by, and share less.
 
-    def _shown_in(self, keyframe_id: int, local: LocalMap) -> BoolArray:
-        """Return which landmarks (N,) a keyframe should see."""
+        The earlier keyframe comes first.
+        """
+        submap, enough = self._submap, self._config.keyframes.weak_landmarks
+        ids = np.array(sorted(submap.keyframes), np.int64)
+        local = LocalMap.of_keyframes(submap, ids.tolist())
+        seen = _rows_of([np.flatnonzero(np.isin(local.landmark_ids, submap.seen_in(k))) for k in ids.tolist()], local)
+        shown = _rows_of([self._shown_in(k, local) for k in ids.tolist()], local)
+        shared, expected = (seen @ seen.T).toarray(), (shown @ seen.T).toarray()
+        times_s = np.array([submap.keyframes[k].timestamp_s for k in ids.tolist()])
+        few = (times_s[None] - times_s[:, None] > APART_S) & (shared < enough)
+        return ids[np.argwhere(few & (np.minimum(expected, expected.T) >= enough))]
+
+    def _shown_in(self, keyframe_id: int, local: LocalMap) -> IntArray:
+        """Return the rows of the landmarks that a keyframe should see."""
         T_cam_submap, pyramid = se3.inverse(self._submap.T_submap_kf[keyframe_id]), self._frontend
         camera = self._submap.K, self._camera
-        shown = np.zeros(len(local), bool)
-        shown[local.predict(T_cam_submap, *camera, pyramid.scale_factor, pyramid.n_octaves).rows] = True
-        return shown
+        return local.predict(T_cam_submap, *camera, pyramid.scale_factor, pyramid.n_octaves).rows
 
     def _landmarks_of(self, view: View, keyframe_id: int) -> IntArray:
         """Return (N, 2) features of a frame, and the landmarks of a keyframe that they match."""
@@ -235,3 +239,9 @@ class Registrar:
         K, seed = self._submap.K, self._config.seed
         T_b_a = estimate_relative_pose(*pixels, sigma, K, self._camera.size_px, seed)
         return np.asarray(sampson_error(fundamental_from_pose(K, T_b_a), *pixels) < CHI2_99[1] * sigma**2)
+
+
+def _rows_of(columns: list[IntArray], local: LocalMap) -> csr_array:
+    """Return a matrix of ones in some columns of each row, one column for each landmark."""
+    ends = np.cumsum([0, *map(len, columns)])
+    return csr_array((np.ones(ends[-1], np.int32), np.concatenate(columns), ends), (len(columns), len(local)))
