@@ -163,6 +163,7 @@ def build_system(
             adjust=partial(
                 adjust_and_prune, robust_k=config.graph.robust_k, min_parallax_rad=np.radians(MIN_PARALLAX_DEG)
             ),
+            match_wide=frontend.match_wide,
             alike=partial(find_resembling, distance=frontend.distance, max_distance=frontend.max_distance_strict),
             atlas_solver=atlas_solver(config),
             refine_at_end=partial(refine_submap, robust_k=config.graph.robust_k),

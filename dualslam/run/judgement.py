@@ -87,9 +87,10 @@ def _coverage(system: System, rows: Sequence[FrameRow]) -> list[Reason]:
         text = "No frame has a pose. The last line of the run says why no map started."
         return [_about_all(rows, ReasonCode.NO_MAP, Level.DOUBTFUL, text)]
     blank = {system.numbers.index_of(i) for i in system.blank}
-    missing = [row for row in rows if not row.in_main_map and row.index not in blank]
+    outside = [row for row in rows if not row.in_main_map]
+    missing = [row for row in outside if row.index not in blank]
     if len(main) >= MIN_COVERAGE * (len(main) + len(missing)):
-        return []
+        return _blank(rows, sorted(row.index for row in outside if row.index in blank))
     dropped = [row for row in missing if row.status is FrameStatus.DROPPED]
     apart = [row for row in missing if system.numbers.number_of(row.index) in system.poses]
     counted = {row.index for row in (*dropped, *apart)}
@@ -113,6 +114,18 @@ def _coverage(system: System, rows: Sequence[FrameRow]) -> list[Reason]:
         "Move slower there, with more light and texture in view."
     )
     return [Reason(ReasonCode.UNPOSED, Level.USABLE, text, first, last)]
+
+
+def _blank(rows: Sequence[FrameRow], blank: list[int]) -> list[Reason]:
+    """Return a remark where many frames could not be posed."""
+    if len(blank) <= (1.0 - MIN_COVERAGE) * len(rows):
+        return []
+    first, last = _longest_run(rows, blank)
+    text = (
+        f"{len(blank)} frames have no pose: they show too little, or nothing that the next frame shows, too. "
+        f"The longest stretch is {first} to {last}. Poses beside them do not suffer."
+    )
+    return [Reason(ReasonCode.UNPOSED, Level.GOOD, text, first, last)]
 
 
 def _longest_run(rows: Sequence[FrameRow], indices: list[int]) -> tuple[int, int]:

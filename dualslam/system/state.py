@@ -20,7 +20,7 @@ from dualslam.core.interfaces import (
     SubmapGraph,
     VisualOdometry,
 )
-from dualslam.core.types import Failure, Features, FloatArray, Frame, LateFrame, View
+from dualslam.core.types import Failure, Features, FloatArray, Frame, LateFrame, Matches, View
 from dualslam.core.walk_news import WalkWatch
 from dualslam.map.graph_beside import BesideGraphs
 from dualslam.map.lens import Calibration
@@ -72,8 +72,9 @@ class Components:
     solved there. `refine_at_end`: has the last word on each submap.
     `patches`: compares frames with the images of older keyframes. `open_graph`: makes a graph of a submap in this
     process, solved. `open_features`: starts one more process, and returns a function that has the features of a frame
-    found there. `new_registrar`, `adjust`, `alike`: for `recovery/registration.py`. `foresee`: precomputes in the
-    background the features that reverse tracking may need. None without background processes.
+    found there. `new_registrar`, `adjust`, `alike`: for `recovery/registration.py`. `match_wide`: as of `Frontend`.
+    `foresee`: precomputes in the background the features that reverse tracking may need. None without background
+    processes.
     """
 
     view_of: Callable[[Frame], View | Failure]
@@ -95,6 +96,7 @@ class Components:
     new_registrar: Callable[[Submap], Registrar]
     adjust: Callable[[Submap, Collection[int]], None]
     alike: Callable[[Mapping[int, Features], Collection[int], int], dict[int, list[int]]]
+    match_wide: Callable[[Features, Features], Matches]
     graphs: BesideGraphs | None = None
     open_features: Callable[[], Callable[[Frame], Frame]] | None = None
     foresee: Callable[[View], None] | None = None

@@ -63,7 +63,7 @@ class System:
     pace : Pace
         Lag reported by the real-time feeder; unused otherwise.
     blank : set of int
-        Frames that show too few features to be posed.
+        Frames without a pose that share too little with either neighbour to be posed by anything.
     audit : PhotometricAudit
         How well the images agree with the map.
     numbers : FrameNumbers
@@ -79,6 +79,7 @@ class System:
         record = Record() if saved is None else Record(saved.atlas, poses=dict(saved.poses))
         self.saved, self.numbers = saved, FrameNumbers(0 if saved is None else saved.next_id)
         self.blank: set[int] = set()
+        self._before: View | None = None  # the frame before, of those that were read
         self._world = saved.main[0] if saved is not None and saved.main else None
         self._worlds = Worlds(record.atlas, self._world)
         self._earlier = earlier = frozenset(record.atlas.submaps)
@@ -267,8 +268,7 @@ class System:
             self.buffer.append(view)
             # 3. Without a live submap, look for the lost one, or try to start one; with one, track.
             outcome = self._without_map(view) if state.live is None else self._with_map(state.live, view)
-            if len(view.features) < state.config.tracking.min_inliers:
-                self.blank.add(frame.index)
+            self._note_blank(view, isinstance(outcome, Failure))
             if self._registers:
                 self._registering.note(view)
         return self._result(frame, outcome, started)
@@ -467,6 +467,17 @@ class System:
         self._starting.begin_anew([view for view in self.buffer if view.index in lost])
 
     # --- records
+
+    def _note_blank(self, view: View, is_lost: bool) -> None:
+        """Note a lost frame that shares too little with the frames before and after it to be posed by anything."""
+        before, self._before = self._before or view, view
+        if not is_lost and before.index not in self.blank:
+            return
+        enough, a, b = self._state.config.tracking.min_inliers, before.features, view.features
+        if before is not view and min(len(a), len(b)) >= enough and len(self._state.parts.match_wide(a, b)) >= enough:
+            self.blank.discard(before.index)
+        elif is_lost:
+            self.blank.add(view.index)
 
     def _result(self, frame: Frame, outcome: Track | Failure, started: float) -> FrameResult:
         row = self.rows[frame.index]

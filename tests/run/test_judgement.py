@@ -71,7 +71,10 @@ def test_frames_without_a_pose_make_a_run_usable_unless_nothing_is_on_them() -> 
     (reason,) = judged(system).reasons
     assert (reason.code, reason.first_frame, reason.last_frame) == (ReasonCode.UNPOSED, 180, N - 1)
     system.blank.update(lost)
-    assert judged(system).level is Level.GOOD
+    verdict = judged(system)
+    assert (verdict.level, verdict.doubt_about(190)) == (Level.GOOD, "")
+    (remark,) = verdict.reasons
+    assert (remark.code, remark.first_frame, remark.last_frame) == (ReasonCode.UNPOSED, 180, N - 1)
 
 
 def test_dropped_frames_make_a_run_usable() -> None:

@@ -14,7 +14,7 @@ from dualslam.core.bundle import FrameRows
 from dualslam.core.config.settings import RecoveryConfig
 from dualslam.core.errors import SolverError
 from dualslam.core.events import EventKind
-from dualslam.core.types import FloatArray, FrameStatus, Track, View
+from dualslam.core.types import Features, FloatArray, FrameStatus, Track, View
 from dualslam.lab.bench.measure import breakages
 from dualslam.map.submap import Submap
 from dualslam.places.sightings import Relocalised, Sightings
@@ -218,6 +218,21 @@ def test_a_short_loss_is_bridged(world: PointWorld) -> None:
     assert not system.events.of_kind(EventKind.FAILED)
     indices, T = main_trajectory(system)
     assert_right(indices, T, world)
+
+
+class ElsewhereForAWhile(PointWorld):
+    """Frames 30 to 34 show another scene."""
+
+    def features(self, i: int) -> Features:
+        return PointWorld(cloud(600), self.T_world_cam, seed=7).features(i) if 30 <= i < 35 else super().features(i)
+
+
+def test_a_lost_frame_could_not_be_posed_if_it_shows_nothing_that_its_neighbours_show(world: PointWorld) -> None:
+    covered = run(PointWorld(world.xyz, world.T_world_cam[:40], covered=frozenset(range(30, 35))))
+    assert covered.blank == set(range(30, 35))
+    elsewhere = run(ElsewhereForAWhile(world.xyz, world.T_world_cam[:40]))
+    assert {i for i, row in elsewhere.rows.items() if row.status is FrameStatus.LOST} == set(range(30, 35))
+    assert not elsewhere.blank
 
 
 @pytest.mark.parametrize("max_lost_s", [0.125, 0.225])
