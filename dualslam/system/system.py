@@ -26,6 +26,7 @@ from dualslam.places.revisits import Revisits
 from dualslam.places.sightings import Relocalised
 from dualslam.recovery.frame_buffer import SLOW_HZ, FrameBuffer
 from dualslam.recovery.manager import Recoveries
+from dualslam.recovery.overlaps import link_overlaps
 from dualslam.recovery.relocaliser import Relocaliser
 from dualslam.system.audit.photometric import PhotometricAudit
 from dualslam.system.audit.verdict import ReasonCode
@@ -327,7 +328,9 @@ class System:
         if state.live is not None and not state.localises:
             self._endings.archive(state.live, "end of sequence")
         if last is not None and not interrupted and not state.localises:
-            self._places.join_rest(self.atlas.submaps.keys() - self._earlier, last)
+            own = self.atlas.submaps.keys() - self._earlier
+            self._places.join_rest(own, last)
+            link_overlaps(state.record, self._connections, state.config, own, last)
             if self._registers:
                 self._registering.finish(last)
         shapes = {} if interrupted or state.localises else self._endings.refine(self._registering.tied)
