@@ -151,8 +151,6 @@ class WorkerDesk:
         self.submit(kind, work)
         queue = self._by_kind[kind]
         while not (ended := self._ended.pop(kind, [])):
-            if not queue.busy:
-                return Ended(work, Failure(FailureReason.WORKER, "the processes have been stopped"))
             self._look(queue, wait=True)
         return ended[0]
 
@@ -248,6 +246,9 @@ class WorkerDesk:
         self._ended[kind].append(ended)
 
     def _hand_out(self, queue: _Queue) -> None:
+        while queue.waiting and not (queue.idle or queue.busy):  # no process could be started: nobody would do them
+            job = queue.waiting.pop(0)
+            self._end(job.kind, Ended(job.work, Failure(FailureReason.WORKER, "the processes have been stopped")))
         while queue.waiting and queue.idle:
             worker = queue.idle.pop(0)
             if not worker.alive:

@@ -33,6 +33,8 @@ def test_workers_that_end_as_they_start_are_told_of_and_cost_their_jobs() -> Non
     assert len(ended) <= MAX_TRIES
     assert all(isinstance(each.result, Failure) for each in ended)
     desk.submit(JobKind.WALK, "there is no worker left")
+    assert not desk.poll(JobKind.WALK)[0].result, "who asks and never waits is answered too"
+    desk.submit(JobKind.WALK, "nor for this one")
     began_s = time.monotonic()
     assert not desk.drain(JobKind.WALK)[0].result
     assert time.monotonic() - began_s < 30  # of 60: nobody is waited for
