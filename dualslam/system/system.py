@@ -473,14 +473,13 @@ class System:
 
     def _note_blank(self, view: View, is_lost: bool) -> None:
         """Note a lost frame that shares too little with the frames before and after it to be posed by anything."""
-        before, self._before = self._before or view, view
-        if not is_lost and before.index not in self.blank:
-            return
-        enough, a, b = self._state.config.tracking.min_inliers, before.features, view.features
-        if before is not view and min(len(a), len(b)) >= enough and len(self._state.parts.match_wide(a, b)) >= enough:
-            self.blank.discard(before.index)
-        elif is_lost:
+        before, self._before = self._before, view
+        if is_lost:
             self.blank.add(view.index)
+        if before is not None and self.blank & {before.index, view.index}:
+            enough, a, b = self._state.config.tracking.min_inliers, before.features, view.features
+            if min(len(a), len(b)) >= enough and len(self._state.parts.match_wide(a, b)) >= enough:
+                self.blank -= {before.index, view.index}
 
     def _result(self, frame: Frame, outcome: Track | Failure, started: float) -> FrameResult:
         row = self.rows[frame.index]

@@ -27,6 +27,7 @@ from dualslam.core.noise_model import MAX_TRIES
 from dualslam.core.types import Failure, FailureReason
 from dualslam.workers.worker import STOP_S, Answer, MakeHandlers, Worker
 
+STOPPED = Failure(FailureReason.WORKER, "the processes have been stopped")
 log = logging.getLogger(__name__)
 
 
@@ -151,6 +152,8 @@ class WorkerDesk:
         self.submit(kind, work)
         queue = self._by_kind[kind]
         while not (ended := self._ended.pop(kind, [])):
+            if not queue.busy:  # another thread has closed the desk
+                return Ended(work, STOPPED)
             self._look(queue, wait=True)
         return ended[0]
 
@@ -248,7 +251,7 @@ class WorkerDesk:
     def _hand_out(self, queue: _Queue) -> None:
         while queue.waiting and not (queue.idle or queue.busy):  # no process could be started: nobody would do them
             job = queue.waiting.pop(0)
-            self._end(job.kind, Ended(job.work, Failure(FailureReason.WORKER, "the processes have been stopped")))
+            self._end(job.kind, Ended(job.work, STOPPED))
         while queue.waiting and queue.idle:
             worker = queue.idle.pop(0)
             if not worker.alive:
