@@ -49,7 +49,7 @@ class RecoveryJob:
     again, by the keyframes that both hold."""
     live_since: int = 0  # the keyframe that the submap's first walk set out from
     late: tuple[LateFrame, ...] = ()  # frames among the views that came too late to be tracked
-    is_again: bool = False  # whether reverse tracking from this submap is repeated: by the first attempt alone
+    first_alone: bool = False  # whether the first attempt alone is made
 
 
 @dataclass(frozen=True, slots=True, eq=False)

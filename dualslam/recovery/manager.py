@@ -63,6 +63,9 @@ class Recoveries:
 
     - `desk`: where the walks are made.
     - `front_ends`: gives those that go on, or may go on, in a submap of the atlas.
+
+    - `in_real_time`: whether frames come by a clock. Then further attempts are not made: they take a minute, for which
+      the next lost map would wait.
     """
 
     def __init__(
@@ -84,6 +87,7 @@ class Recoveries:
         self._connections = connections
         self._config = config
         self._front_ends = front_ends
+        self.in_real_time = False
         self._lost: dict[int, Loss] = {}  # not linked yet, or too loosely, until the newer map is lost as well
         self._under_way: dict[int, _UnderWay] = {}  # by the new submap's id
         self._circumstances: dict[int, dict[str, Any]] = {}  # of the walk, by the new submap's id
@@ -189,7 +193,7 @@ class Recoveries:
             joined={m: sound_copy(submaps[m]) for m in joined},
             live_since=self._retries.start_of(submap, newest_id),
             late=late,
-            is_again=now is not None,
+            first_alone=now is not None or self.in_real_time,
         )
         n_live = self._retries.n_live(submap, newest_id if now is None else now.index)
         self._under_way[submap.id] = _UnderWay(time.perf_counter(), n_live, again=now is not None)

@@ -76,7 +76,7 @@ def recover_in_steps(job: RecoveryJob, parts: RecoveryParts) -> Steps[RecoveryRe
             continue
         walks.append((yield from _make_attempt(job, parts, attempt, tries)))
         tries = walks[-1].tries
-        if walks[-1].is_final or (job.is_again and walks[-1].problem is None):
+        if walks[-1].is_final or (job.first_alone and walks[-1].problem is None):
             break
     best = _best_of(walks)
     if best is not None and (gap := best.lost_scale_from(parts.max_scale_sigma)) is not None:

@@ -249,6 +249,7 @@ class System:
                 self._starting.begin_again()
             elif state.lost:
                 self._begin_anew()
+        self._recoveries.in_real_time = state.pace.in_real_time
         self._recoveries.collect(state.live, frame)
         if state.pace.in_real_time:
             held_s = state.pace.clock() - began_s

@@ -89,7 +89,8 @@ def test_a_map_of_this_run_may_show_what_an_earlier_one_saw_moments_before_by_it
         assert answer.reason is FailureReason.LEAP
 
 
-def test_reverse_tracking_is_told_the_ways_of_this_run_alone() -> None:
+def lost_and_begun_anew() -> tuple[Recoveries, list[RecoveryJob], Submap, View]:
+    """Return recoveries after a loss, the list of what they submit, the new submap, and its newest frame."""
     record, lost = book()
     live = lost.copy()
     live.id = 1
@@ -106,10 +107,24 @@ def test_reverse_tracking_is_told_the_ways_of_this_run_alone() -> None:
     parts = (Fake(submit=lambda kind, job: jobs.append(job)), None, Fake(camera=CAMERA, covariance=None), None)
     recoveries = Recoveries(record, buffer, *parts, RecoveryConfig(), list)  # type: ignore[arg-type]
     recoveries.declare_lost(0, FIRST + 28, "inliers", FIRST + 30)
+    return recoveries, jobs, live, view
+
+
+def test_reverse_tracking_is_told_the_ways_of_this_run_alone() -> None:
+    recoveries, jobs, live, view = lost_and_begun_anew()
     recoveries.start(live, view)
     (job,) = jobs
     assert [pose.index for pose in job.poses] == list(range(FIRST + 100, FIRST + 130))
     assert job.paths[0].index.tolist() == list(range(FIRST, FIRST + 30))
+
+
+def test_in_real_time_and_if_made_again_the_first_attempt_is_made_alone() -> None:
+    recoveries, jobs, live, view = lost_and_begun_anew()
+    recoveries.start(live, view)
+    recoveries.start(live, view, now=view)
+    recoveries.in_real_time = True
+    recoveries.start(live, view)
+    assert [job.first_alone for job in jobs] == [False, True, True]
 
 
 def test_a_saved_map_in_which_no_frame_of_this_run_is_left_is_archived() -> None:

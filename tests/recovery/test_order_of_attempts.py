@@ -19,7 +19,7 @@ BLANK, UNKNOWN = Failure(FailureReason.NO_TEXTURE), Failure(FailureReason.DEGENE
 LOOSE, LOST = Failure(FailureReason.SCALE), Failure(FailureReason.SCALE_LOST)
 
 
-def recover(monkeypatch: pytest.MonkeyPatch, seen: dict[str, list[Failure]], is_again: bool = False) -> list[str]:
+def recover(monkeypatch: pytest.MonkeyPatch, seen: dict[str, list[Failure]], first_alone: bool = False) -> list[str]:
     """Return which of the attempts `first` and `follower` are made; `seen`: of each, the frames without a pose."""
     made: list[str] = []
 
@@ -38,7 +38,7 @@ def recover(monkeypatch: pytest.MonkeyPatch, seen: dict[str, list[Failure]], is_
     new: Any = SimpleNamespace
     attempts = Attempt("first", new), Attempt("follower", new, max_unrecognised=5)
     submap: Any = SimpleNamespace(copy=lambda: None)
-    job = RecoveryJob(submap, 9, {0: submap}, {}, (), (), new(), None, is_again=is_again)
+    job = RecoveryJob(submap, 9, {0: submap}, {}, (), (), new(), None, first_alone=first_alone)
     parts: Any = SimpleNamespace(attempts=attempts, max_scale_sigma=0.025)
     result = result_of(recover_in_steps(job, parts))
     assert isinstance(result, RecoveryResult)
@@ -48,7 +48,7 @@ def recover(monkeypatch: pytest.MonkeyPatch, seen: dict[str, list[Failure]], is_
 
 
 @pytest.mark.parametrize(
-    ("first", "is_again", "made"),
+    ("first", "first_alone", "made"),
     [
         ([BLANK, UNKNOWN], False, ["first", "follower"]),
         ([BLANK, BLANK], False, ["first"]),
@@ -58,12 +58,12 @@ def recover(monkeypatch: pytest.MonkeyPatch, seen: dict[str, list[Failure]], is_
         ([BLANK, LOST], False, ["first"]),
         ([UNKNOWN, LOST], False, ["first", "follower"]),
     ],
-    ids=["not recognised", "nothing to see", "all posed", "again", "loose", "scale lost", "skipped, scale lost"],
+    ids=["not recognised", "nothing to see", "all posed", "first alone", "loose", "scale lost", "skipped, scale lost"],
 )
 def test_a_follower_is_made_once_if_it_may_do_better(
-    monkeypatch: pytest.MonkeyPatch, first: list[Failure], is_again: bool, made: list[str]
+    monkeypatch: pytest.MonkeyPatch, first: list[Failure], first_alone: bool, made: list[str]
 ) -> None:
-    assert recover(monkeypatch, {"first": first, "follower": [UNKNOWN]}, is_again) == made
+    assert recover(monkeypatch, {"first": first, "follower": [UNKNOWN]}, first_alone) == made
 
 
 @pytest.mark.parametrize(
