@@ -64,8 +64,7 @@ class Recoveries:
     - `desk`: where the walks are made.
     - `front_ends`: gives those that go on, or may go on, in a submap of the atlas.
 
-    - `in_real_time`: whether frames come by a clock. Then further attempts are not made: they take a minute, for which
-      the next lost map would wait.
+    - `in_real_time`: whether frames come by a clock. Then the first attempt is made alone: the next lost map waits.
     """
 
     def __init__(
@@ -333,15 +332,8 @@ class Recoveries:
         return {"cause": loss.cause, "k": k, "k_r": len(indices) - k}
 
     def _failed(self, job: RecoveryJob, now: FrameStamp, failure: Failure, seconds: float) -> None:
-        self._record.event(
-            EventKind.RECOVERY_FAILED,
-            now,
-            job.submap.id,
-            lost=sorted(job.onsets),
-            reason=str(failure.reason),
-            detail=failure.detail,
-            seconds=seconds,
-        )
+        data = {"lost": sorted(job.onsets), "reason": str(failure.reason), "detail": failure.detail, "seconds": seconds}
+        self._record.event(EventKind.RECOVERY_FAILED, now, job.submap.id, **data)
 
     # --- taking a result in
 
