@@ -1,4 +1,4 @@
-# make setup | demo | test | test-all | fuzz | check | docs | package | bench | accuracy | results | lock | clean
+# make setup | demo | test | test-all | fuzz | faults | check | docs | package | bench | accuracy | results | lock | clean
 # A fresh clone needs python3 (3.11 to 3.13, for `make demo` alone 3.14 too; choose with PYTHON=python3.12), its venv and pip modules, and make.
 
 PYTHON ?= python3
@@ -15,7 +15,7 @@ export OPENBLAS_NUM_THREADS = 1
 export PIP_DISABLE_PIP_VERSION_CHECK = 1
 unexport PYTHONPATH
 
-.PHONY: setup demo test test-all fuzz check docs package format bench accuracy results lock clean
+.PHONY: setup demo test test-all fuzz faults check docs package format bench accuracy results lock clean
 .DEFAULT_GOAL := setup
 
 setup: $(STAMP)
@@ -54,6 +54,10 @@ test-all: $(KORNIA_STAMP)
 # Damaged images, cameras, maps, configurations, measurements and videos, by seed: make fuzz ARGS="--cases 10000"
 fuzz: setup
 	$(BIN)/python -m tests.fuzz $(ARGS)
+
+# Runs that are interrupted, killed, out of disk or of workers, or whose solver fails, by seed: make faults ARGS="--kind kill"
+faults: setup
+	$(BIN)/python -m tests.fuzz.faults $(ARGS)
 
 check: setup
 	$(BIN)/ruff check .

@@ -107,10 +107,10 @@ def compose(poses: Iterable[FramePose], atlas: Atlas, S_world_submap: dict[int, 
     `S_world_submap` (dict of int to (4, 4)): the submaps to take in; frames of others are left out.
     """
     kept = sorted((p for p in poses if p.submap_id in S_world_submap), key=lambda p: p.index)
-    T_world_cam = np.empty((len(kept), 4, 4))
-    for i, pose in enumerate(kept):
-        T_submap_cam = atlas.submaps[pose.submap_id].resolve_anchor(pose.keyframe_id, pose.T_kf_cam)
-        T_world_cam[i] = sim3.act_on_pose(S_world_submap[pose.submap_id], T_submap_cam)
+    T = np.array([atlas.submaps[p.submap_id].resolve_anchor(p.keyframe_id, p.T_kf_cam) for p in kept])
+    T_world_cam, submap_of = T.reshape(-1, 4, 4), np.array([p.submap_id for p in kept], np.int64)
+    for m, S in S_world_submap.items():
+        T_world_cam[submap_of == m] = sim3.act_on_pose(S, T_world_cam[submap_of == m])
     timestamps_s = np.array([p.timestamp_s for p in kept], float)
     return Trajectory(timestamps_s, T_world_cam, np.array([p.index for p in kept], np.int64))
 

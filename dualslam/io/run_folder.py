@@ -193,7 +193,12 @@ class RunFolder:
         write_text(self.path / REPORT, page)
 
     def write(self, record: RunRecord) -> None:
-        """Write frames, trajectories and the summary. May be called again as the run goes on: the last word holds."""
+        """Write frames, trajectories and the summary."""
+        self.write_poses(record)
+        self.write_summary(record.summary)
+
+    def write_poses(self, record: RunRecord) -> None:
+        """Write frames and trajectories. May be called again as the run goes on: the last word holds."""
         self.write_frames(record.frames)
         main = record.main.in_time_order()
         write_tum(self.path / TRAJECTORY, main)
@@ -205,7 +210,6 @@ class RunFolder:
         for file in files_named(self.path / SUBMAPS, _SUBMAP_NAME):
             if file.name not in kept:
                 file.unlink()
-        self.write_summary(record.summary)
 
     def write_frames(self, rows: Iterable[FrameRow]) -> None:
         """Write ``frames.csv``."""

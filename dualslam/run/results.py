@@ -72,6 +72,8 @@ def frame_rows(
     system: System,
     main: Trajectory | None = None,
     latencies_ms: Mapping[int, float] | None = None,
+    *,
+    with_claims: bool = True,
 ) -> list[FrameRow]:
     """Return a row for every frame of the source, in the order in which they came: those of ``frames.csv``.
 
@@ -84,9 +86,11 @@ def frame_rows(
         That of `trajectories_of`, if it is there already.
     latencies_ms : mapping of int to float, optional
         Of the frames that were tracked, by their index, as the harness measured them. Else that of their steps.
+    with_claims : bool
+        Fill the columns ``sigma_*``, which takes seconds.
     """
     in_main = set((trajectories_of(system).main if main is None else main).index.tolist())
-    claims = claims_in_atlas(system.atlas)
+    claims = claims_in_atlas(system.atlas) if with_claims else {}
     return [
         replace(
             _with_claim(system, row, claims),
@@ -95,14 +99,14 @@ def frame_rows(
             latency_ms=(latencies_ms or {}).get(system.numbers.index_of(row.index), row.latency_ms),
             method=row.method if row.index in system.poses else None,
         )
-        for row in system.rows.values()
+        for row in list(system.rows.values())
     ]
 
 
 def _with_claim(system: System, row: FrameRow, claims: Mapping[int, Mapping[int, Claim]]) -> FrameRow:
     """Return a frame's row with what the map claims of the keyframe that it hangs on."""
     pose = system.poses.get(row.index)
-    if pose is None:
+    if pose is None or not claims:
         return row
     claim = claims[pose.submap_id][system.atlas.submaps[pose.submap_id].keyframe_for(pose.keyframe_id)]
     known = [None if np.isnan(sigma) else sigma for sigma in (claim.sigma_position_rel, claim.sigma_scale)]

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import logging
 import math
+import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import asdict, dataclass, replace
 from hashlib import sha256
@@ -59,6 +61,9 @@ SEARCHED_SIGMA = 0.031
 that it has no model for. With it the errors of eight pieces of recordings come to what is claimed (docs/notes, "A
 camera of which nothing is known")."""
 
+SAVE_S, SAVING_SHARE = 10.0, 0.01
+"""How often frames and trajectory are written while a run goes on, which may be killed. Where that takes long it comes
+less often, so that this is its share of the time."""
 N_PICTURES = 60
 """On ``map.html``, beside the slider: 200 KB."""
 SEEN_AGAIN = (EventKind.LOOP_CLOSED, EventKind.MERGED, EventKind.RELOCALISED)
@@ -224,9 +229,11 @@ def run_to_folder(
             )
 
         refusals = StartRefusals()
+        poses_so_far = _PosesSoFar(system, folder)
 
         def after_frame(result: FrameResult) -> None:
             _write_new_events(system, folder)
+            poses_so_far.write_if_due()
             refusals.note(result)
             if on_frame is not None:
                 on_frame(result)
@@ -250,6 +257,7 @@ def run_to_folder(
                 interrupts=interrupts,
                 repeats=recorded,
             )
+            poses_so_far.end()
             system.desk.close()  # a system that broke, or was left, has not come to it
             for index in report.dropped:
                 folder.append_schedule({"dropped": index})
@@ -496,6 +504,37 @@ def _write_pages(folder: RunFolder) -> None:
     if (page := map_page(run)) is not None:
         folder.write_map_page(page)
     folder.write_report(report_page(run))
+
+
+class _PosesSoFar:
+    """Frames and trajectory, written on a thread while a run goes on: what a process leaves that is killed."""
+
+    def __init__(self, system: System, folder: RunFolder) -> None:
+        self._system, self._folder = system, folder
+        self._thread = ThreadPoolExecutor(1)
+        self._writing: Future[None] | None = None
+        self._due_s = time.monotonic() + SAVE_S
+
+    def write_if_due(self) -> None:
+        """Begin to write.
+
+        Raises `OutputError` if the last time it could not be done.
+        """
+        if self._writing is not None and self._writing.done():
+            self._writing.result()
+            self._writing = None
+        if self._writing is None and time.monotonic() >= self._due_s:
+            self._writing = self._thread.submit(self._write, trajectories_of(self._system), time.monotonic())
+
+    def _write(self, found: Trajectories, began_s: float) -> None:
+        rows = frame_rows(self._system, found.main, with_claims=False)
+        self._folder.write_poses(RunRecord(rows, found.main, found.unlinked))
+        ended_s = time.monotonic()
+        self._due_s = ended_s + max(SAVE_S, (ended_s - began_s) / SAVING_SHARE)
+
+    def end(self) -> None:
+        """Wait for what is being written."""
+        self._thread.shutdown()
 
 
 class _Watched:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -80,6 +81,27 @@ def test_what_a_sequence_or_a_callback_raises_costs_no_results(
     assert system.n_finished == 1
     assert len(read_frames(tmp_path / "run" / "frames.csv")) == n_frames
     assert (tmp_path / "run" / "report.html").exists()
+
+
+def test_frames_and_trajectory_are_written_while_a_run_goes_on(
+    system: FakeSystem,
+    build: Callable[[Config, Camera], FakeSystem],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("dualslam.run.session.SAVE_S", 0.0)
+    monkeypatch.setattr("dualslam.run.session.SAVING_SHARE", np.inf)
+    run, found = tmp_path / "run", []
+
+    def look(result: FrameResult) -> None:
+        time.sleep(0.05)
+        if (run / "frames.csv").exists() and (run / "trajectory.txt").exists():
+            found.append((len(read_frames(run / "frames.csv")), len(read_tum(run / "trajectory.txt"))))
+            assert not (run / "summary.json").exists()
+
+    with pytest.raises(OSError, match="unplugged"):
+        run_to_folder(Config(), Unplugged(12), run, build=build, on_frame=look)  # type: ignore[arg-type]
+    assert (1, 1) <= found[0] < found[-1] <= (12, 12)
 
 
 class WithTruth:
