@@ -6,7 +6,7 @@ or posed again later. A frame claims what the keyframe does that it hangs on.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -63,17 +63,19 @@ class _Known:
 
 
 def claims_in_atlas(atlas: Atlas) -> dict[int, dict[int, Claim]]:
-    """Return the claims of all submaps, with their scales against the best-tied stretch of those that are linked.
+    """Return the claims of all submaps."""
+    return {m: own for linked in atlas.components() for m, own in claims_in(atlas, linked).items()}
+
+
+def claims_in(atlas: Atlas, linked: Collection[int]) -> dict[int, dict[int, Claim]]:
+    """Return the claims of submaps that are linked, with their scales against the best-tied stretch of them all.
 
     It is in the largest submap. Along the best links to it, variances add: of each link, and between the links' places.
     """
-    claims: dict[int, dict[int, Claim]] = {}
-    for component in atlas.components():
-        links = dict(enumerate(link for link in atlas.believed if link.a != link.b and link.a in component))
-        known = {m: _ask(atlas, atlas.submaps[m], links) for m in component}
-        largest = max(component, key=lambda m: len(atlas.submaps[m].keyframes))
-        claims |= {m: known[m].claims(*seen) for m, seen in _seen_from(largest, known, links).items()}
-    return claims
+    links = dict(enumerate(link for link in atlas.believed if link.a != link.b and link.a in linked))
+    known = {m: _ask(atlas, atlas.submaps[m], links) for m in linked}
+    largest = max(linked, key=lambda m: len(atlas.submaps[m].keyframes))
+    return {m: known[m].claims(*seen) for m, seen in _seen_from(largest, known, links).items()}
 
 
 def _seen_from(largest: int, known: Mapping[int, _Known], links: Mapping[int, Link]) -> dict[int, tuple[int, float]]:

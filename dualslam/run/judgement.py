@@ -14,6 +14,7 @@ from dualslam.core.trajectory import Trajectory
 from dualslam.core.types import Failure, FrameStatus
 from dualslam.map.frame_records import FrameRow
 from dualslam.run.camera_judgement import MAX_PATH_CHANGE, judge_camera
+from dualslam.run.claims import claims_in
 from dualslam.run.measuring import MANY_REJECTED, Measured
 from dualslam.run.results import Trajectories
 from dualslam.system.audit.photometric import Disagreement, Sample, find_disagreement
@@ -240,11 +241,17 @@ def _loose_joins(system: System, trajectories: Trajectories) -> list[Reason]:
 
 
 def _replaced(system: System, trajectories: Trajectories) -> list[Reason]:
-    """Find frames that the main map has taken from another one whose path it contradicts: one is wrong."""
+    """Find frames that the main map has taken from another one whose path it contradicts: one is wrong.
+
+    Where the other map does not know its own scale, it contradicts nothing.
+    """
     centres = dict(zip(trajectories.main.index.tolist(), trajectories.main.T_world_cam[:, :3, 3], strict=True))
     for earlier in (submap for m, submap in system.atlas.submaps.items() if m not in trajectories.main_submaps):
         index_of = {system.numbers.index_of(k): k for k in sorted(earlier.keyframes.keys() - earlier.condemned)}
         index = [i for i in index_of if i in centres]
+        if len(index) >= MIN_COMPARED:
+            known = claims_in(system.atlas, system.atlas.component_of(earlier.id))[earlier.id]
+            index = [i for i in index if not known[index_of[i]].sigma_scale > UNSURE_SCALE]
         if len(index) < MIN_COMPARED:
             continue
         was = earlier.keyframe_poses(np.array([index_of[i] for i in index]))[:, :3, 3]

@@ -16,6 +16,8 @@ from dualslam.run.results import frame_rows, trajectories_of
 from dualslam.system.audit.photometric import MIN_SAMPLES, Sample
 from dualslam.system.audit.verdict import Level, ReasonCode, Verdict
 from tests.cli.fakes import NO_FEATURES, FakeSystem
+from tests.run.test_claims import run as run_in_world
+from tests.run.test_claims import without_ties
 
 N = 200
 IMAGE = np.zeros((4, 4), np.uint8)
@@ -142,6 +144,24 @@ def test_a_map_that_contradicts_the_one_it_was_replaced_by_makes_a_run_usable(be
     assert verdict.level is level
     about = [(reason.code, reason.first_frame, reason.last_frame) for reason in verdict.reasons]
     assert about == [(ReasonCode.REPLACED, 20, 115)] * (level is Level.USABLE)
+
+
+def test_a_map_that_does_not_know_its_own_scale_contradicts_nothing() -> None:
+    system, _ = run_in_world.__wrapped__()
+    main = system.atlas.submaps[0]
+    ids = sorted(main.keyframes)
+    border = ids[len(ids) // 2]
+    earlier = without_ties(main, border)
+    earlier.id = 1
+    seen_late = np.unique(earlier.observations["landmark"][earlier.observations["kf"] >= border])
+    centre = earlier.T_submap_kf[border][:3, 3].copy()
+    for k in ids:
+        if k >= border:
+            earlier.T_submap_kf[k][:3, 3] += 0.5 * (earlier.T_submap_kf[k][:3, 3] - centre)
+    earlier.landmarks["xyz_mu"][seen_late] += 0.5 * (earlier.landmarks["xyz_mu"][seen_late] - centre)
+    system.atlas.add(earlier)
+    verdict = judge_run(system, trajectories_of(system), frame_rows(system))
+    assert verdict.level is Level.GOOD
 
 
 def test_a_camera_that_hung_has_not_jumped() -> None:
