@@ -1,7 +1,7 @@
 """What happens to a run from outside, by seed: a run is killed, its disk is full, its solver fails. It loses nothing.
 
-`python -m tests.fuzz.faults --cases 1000` makes many. A fault is printed with the kind and seed that repeat it; times
-are of this process's use of the processor, so that a repetition is alike and not the same.
+`python -m tests.fuzz.faults --cases 1000` makes many. A loss is printed with the kind and seed that repeat it.
+Times are CPU times of the process, so a repetition is alike and not the same.
 """
 
 from __future__ import annotations
