@@ -51,7 +51,8 @@ class _Parser(argparse.ArgumentParser):
         return super().parse_known_args(args, namespace)
 
     def error(self, message: str) -> NoReturn:
-        self.exit(2, f"{self.prog}: {message}{self._meant(message)}; see {self.prog} --help\n")
+        prog = self._of_command().prog
+        self.exit(2, f"{prog}: {message}{self._meant(message)}; see {prog} --help\n")
 
     def _meant(self, message: str) -> str:
         wrong, offered, choices = message.partition(" (choose from ")

@@ -87,6 +87,8 @@ def one_sentence(capsys: pytest.CaptureFixture[str]) -> str:
         ("config --set corruptions=[{kind:bluur}]", "corruptions[0]"),
         ("run synthetic:street,size=3 --fov 70 --out there", "no option 'size'"),
         ("run here --ouut there", "--ouut is no option, did you mean --out?"),
+        ("render street --out there --foo 3", "dualslam render: unrecognized arguments: --foo 3"),
+        ("render street --out there --foo 3", "see dualslam render --help"),
         ("run here --out there --sed 3", "--sed is no option, did you mean --seed?"),
         ("rnu here", "invalid choice: 'rnu'"),
         ("rnu here", "did you mean 'run'?"),
