@@ -21,6 +21,7 @@ from dualslam.linking.motion import find_reached
 from dualslam.linking.scale_observability import position_sigmas
 from dualslam.map.frame_observations import FrameObservations
 from dualslam.map.submap import Submap
+from dualslam.map.submap_change import landmarks_shown_in
 from dualslam.recovery.registration import REACH, Registration
 from dualslam.system.state import State
 
@@ -216,24 +217,30 @@ class Registering:
             record.pose(pose, n, n, seen, FrameMethod.WIDE)
             if is_new:
                 record.rows[k].status = FrameStatus.RECOVERED
-        for pose in hanging:
-            record.pose(pose)
+        for pose, seen in hanging:
+            record.pose(pose, observations=seen)
 
-    def _hanging_on(self, submap: Submap, added: list[int]) -> Iterator[FramePose]:
-        """Yield new poses of frames that hang on registered keyframes of another submap, in the unit of the new one."""
+    def _hanging_on(self, submap: Submap, added: list[int]) -> Iterator[tuple[FramePose, FrameObservations]]:
+        """Yield the frames that hang on registered keyframes of another submap, and have seen enough of the new one.
+
+        The pose is in the unit of the new one, and is found anew by what the frame has seen once that is refined: the
+        other submap may be bent.
+        """
         record = self._state.record
         taken = {k: record.poses[k].submap_id for k in added if k in record.poses}
+        shown = {m: landmarks_shown_in(submap, record.atlas.submaps[m]) for m in set(taken.values())}
         for i, pose in record.poses.items():
-            m = pose.submap_id
-            if i not in record.rows or m not in taken.values():
+            m, seen = pose.submap_id, record.observations.get(i)
+            if i not in record.rows or m not in shown or seen is None or seen.submap_id != m:
                 continue
-            other = record.atlas.submaps[m]
+            other, seen = record.atlas.submaps[m], seen.in_submap(submap.id, shown[m])
             anchor = other.anchored(pose.keyframe_id, other.resolve_anchor(pose.keyframe_id, pose.T_kf_cam))
             k, own = anchor.keyframe_id, [a for a in taken if taken[a] == m and a != anchor.keyframe_id]
-            if i != k and taken.get(k) == m and own:
+            is_known = len(seen.landmark_ids) >= self._state.config.health.min_inliers
+            if i != k and taken.get(k) == m and own and is_known:
                 T_kf_cam = anchor.T_kf_cam.copy()
                 T_kf_cam[:3, 3] *= _scale_between(submap, other, k, min(own, key=lambda a: (abs(a - i), a)))
-                yield replace(pose, submap_id=submap.id, keyframe_id=k, T_kf_cam=T_kf_cam)
+                yield replace(pose, submap_id=submap.id, keyframe_id=k, T_kf_cam=T_kf_cam), seen
 
 
 def _scale_between(submap: Submap, other: Submap, a: int, b: int) -> float:

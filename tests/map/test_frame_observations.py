@@ -17,6 +17,7 @@ from dualslam.map.frame_observations import FrameObservations
 from dualslam.map.frame_records import FrameRow
 from dualslam.map.split import submap_of
 from dualslam.map.submap import NO_LANDMARK, Submap
+from dualslam.map.submap_change import landmarks_shown_in
 from dualslam.testing.graph_scene import guessed_submap, make_features, make_scene
 
 N, FRAME = 8, 100
@@ -59,6 +60,23 @@ def test_a_frame_goes_along_with_its_landmarks() -> None:
     submap, seen, T = seen_by_a_frame()
     submap.transform(1.0, OFF)
     assert off_by(seen.pose(submap, T, 0.4, 25), OFF @ T) < 1e-4
+
+
+def test_a_frame_of_a_bent_map_is_posed_by_what_a_right_one_shows_in_the_same_keyframes() -> None:
+    submap, seen, T = seen_by_a_frame()
+    bent = submap.copy()
+    bent.id = 1
+    bent.landmarks["xyz_mu"][:] *= [1.0, 1.0, 1.5]
+    n = len(submap.landmarks)
+    for k, ids in submap.landmark_of.items():
+        submap.landmark_of[k] = np.where(ids == NO_LANDMARK, NO_LANDMARK, n - 1 - ids)
+    submap.landmarks["xyz_mu"][:] = submap.landmarks["xyz_mu"][::-1].copy()  # the same map by other numbers
+    unknown = seen.landmark_ids[0]
+    for ids in bent.landmark_of.values():
+        ids[ids == unknown] = NO_LANDMARK
+    there = seen.in_submap(submap.id, landmarks_shown_in(submap, bent))
+    assert len(there.landmark_ids) == len(seen.landmark_ids) - 1
+    assert off_by(there.pose(submap, T @ OFF, 0.4, 25), T) < 1e-4
 
 
 def test_outliers_have_no_say_under_the_loss_that_the_map_has() -> None:
