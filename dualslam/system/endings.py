@@ -54,11 +54,8 @@ class Endings:
 
     # --- with the track
 
-    def give_up(self, live: VisualOdometry, view: View, failure: Failure, may_return: bool) -> None:
-        """Declare the track failed: archive the submap whole. Reverse tracking may link it.
-
-        `may_return`: tracking may find it again before, too.
-        """
+    def give_up(self, live: VisualOdometry, view: View, failure: Failure) -> None:
+        """Declare the track failed: archive the submap whole. Reverse tracking may link it."""
         state, lost = self._state, self._state.lost
         suspected = state.health.suspected()
         onset = min([lost[0].index, *(frame.index for frame in suspected)])
@@ -79,11 +76,8 @@ class Endings:
         state.live = None
         state.begin_health()
         # Not where two poses stood.
-        doubtful = failure.reason in (FailureReason.LOOK_ALIKE, FailureReason.LEAP)
-        if doubtful:
+        if failure.reason in (FailureReason.LOOK_ALIKE, FailureReason.LEAP):
             self._sightings.avoid(live.submap.id)
-        if may_return and not doubtful:
-            state.relocaliser.begin(live)
 
     def break_at(self, live: VisualOdometry, view: View, first: int, failure: Failure) -> None:
         """End a map that is broken since frame `first`; reverse tracking will pose the frames since then."""
@@ -92,7 +86,7 @@ class Endings:
         state.buffer.freeze()
         drop_corrupted(state.record, live.submap.id, first)
         live.submap.condemn({k for k in live.submap.keyframes if k >= first})
-        self.give_up(live, view, failure, may_return=False)
+        self.give_up(live, view, failure)
 
     # --- where it has lost its scale
 

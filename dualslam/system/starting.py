@@ -78,31 +78,6 @@ class Starting:
     # --- a map that is there
 
     def find_again(self, view: View) -> Track | None:
-        """Continue in the map that was lost last, or in any other, if the current frames show it."""
-        if self._state.relocaliser.note(view) and (track := self._find_lost(view)):
-            return track
-        return self._find_any(view)
-
-    def _find_lost(self, view: View) -> Track | None:
-        """Continue in the map that was lost last, once two frames in a row show it."""
-        state = self._state
-        with state.record.timer.measure("relocalisation"):
-            relocaliser = state.relocaliser.sighted(view)
-        if relocaliser is None:
-            return None
-        track = self._tracking.track(relocaliser, view)
-        if isinstance(track, Failure):
-            if track.reason is FailureReason.SOLVER:
-                state.relocaliser.end()
-            return None
-        state.live = relocaliser
-        state.relocaliser.end()
-        self._n_without_map = 0
-        state.record.event(EventKind.RELOCALISED, view, relocaliser.submap.id, n_inliers=track.n_inliers)
-        self._go_on(relocaliser.submap, view)
-        return track
-
-    def _find_any(self, view: View) -> Track | None:
         """Continue in any submap that a few frames in a row show: at once in a saved map, else where no map starts."""
         state, record = self._state, self._state.record
         self._n_without_map += len(view.features) >= state.config.tracking.min_inliers
@@ -115,13 +90,13 @@ class Starting:
         if found is None:
             return None
         state.live, submap = found.odometry, found.odometry.submap
-        state.relocaliser.end()
         self._n_without_map = 0
         state.begin_health()
         for track, T_kf_cam in (*found.earlier, (found.track, state.live.relative_pose(found.track))):
             at = track.view
             pose = FramePose(at.index, at.timestamp_s, submap.id, found.reference, T_kf_cam)
-            record.pose(pose, track.n_matches, track.n_inliers, method=FrameMethod.WIDE)
+            seen = FrameObservations.of(at.features, track.landmark_ids, submap.id)
+            record.pose(pose, track.n_matches, track.n_inliers, None if state.localises else seen, FrameMethod.WIDE)
         first = found.earlier[0][0]
         record.event(
             EventKind.RELOCALISED,
@@ -223,7 +198,6 @@ class Starting:
         *_, newest = state.buffer.newest(1)
         state.record.event(EventKind.SHUTTER_FOUND, newest, None, readout_s=shutter.readout_s)
         correct_views(state.buffer, shutter, state.parts.calibration.camera)
-        state.relocaliser.end()  # it is of the pixels of before
         *waiting, newest = state.buffer.newest(self._reach + 1)
         tries_again, self._is_held_back = self._is_held_back and not state.pace.in_real_time, False
         free = self._without_map_yet(waiting)
@@ -270,7 +244,6 @@ class Starting:
         """Let a new submap be the live one, and reverse tracking start from it."""
         state = self._state
         state.live = odometry
-        state.relocaliser.end()
         self._n_without_map = 0
         state.begin_health()
         self._recoveries.start(odometry.submap, view)

@@ -27,7 +27,6 @@ from dualslam.map.lens import Calibration
 from dualslam.map.submap import Submap
 from dualslam.places.sightings import PlaceParts
 from dualslam.recovery.frame_buffer import FrameBuffer
-from dualslam.recovery.relocaliser import Relocaliser
 from dualslam.system.audit.photometric import PhotometricAudit
 from dualslam.system.health import HealthMonitor
 from dualslam.system.motion_watch import MotionWatch
@@ -45,7 +44,6 @@ class State:
     buffer: FrameBuffer
     saved: StoredMap | None  # the map that this run continues
     localises: bool  # frames are only found in that map, and nothing is added to it
-    relocaliser: Relocaliser  # looks for the map that was lost last
     health: HealthMonitor  # of the tracking in the live map, or of the attempts at one
     audit: PhotometricAudit
     pace: Pace = field(default_factory=Pace)
@@ -54,8 +52,8 @@ class State:
     lost: list[View] = field(default_factory=list)  # the frames since tracking was lost in the live map
 
     def front_ends(self) -> list[VisualOdometry]:
-        """Return the front ends that track in a submap, or may soon: they must follow when it moves."""
-        return [front_end for front_end in (self.live, self.relocaliser.relocaliser) if front_end is not None]
+        """Return the front end that tracks in a submap, if there is one: it must follow when that moves."""
+        return [] if self.live is None else [self.live]
 
     def begin_health(self) -> None:
         """Forget the signs of trouble: another map is tracked from now on, or none."""

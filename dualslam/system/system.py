@@ -27,7 +27,6 @@ from dualslam.places.sightings import Relocalised
 from dualslam.recovery.frame_buffer import SLOW_HZ, FrameBuffer
 from dualslam.recovery.manager import Recoveries
 from dualslam.recovery.overlaps import link_overlaps
-from dualslam.recovery.relocaliser import Relocaliser
 from dualslam.system.audit.photometric import PhotometricAudit
 from dualslam.system.audit.verdict import ReasonCode
 from dualslam.system.camera.background import Calibrations
@@ -88,9 +87,9 @@ class System:
         self.events, self.timer = record.events, record.timer
         self.buffer = FrameBuffer(config.buffer.duration_s, config.buffer.max_mb)
         self.buffer.freeze()  # no map yet, as after a loss: the first start is tracked back from to the first frame
-        relocaliser, health = Relocaliser(components.new_relocaliser, config), HealthMonitor(config.health)
+        health = HealthMonitor(config.health)
         self.audit = PhotometricAudit(components.patches)
-        self._state = State(components, config, record, self.buffer, saved, localise, relocaliser, health, self.audit)
+        self._state = State(components, config, record, self.buffer, saved, localise, health, self.audit)
         self.pace = self._state.pace
         # Background results that come into the map between two frames.
         self._connections = Connections(
@@ -243,8 +242,7 @@ class System:
         self.desk.begin_frame(source.index, state.pace.in_real_time)
         self._graphs.collect(frame)
         self._places.collect(frame)
-        in_map = state.relocaliser.relocaliser if state.live is None else state.live
-        if self._calibrations.collect(in_map, frame):
+        if self._calibrations.collect(state.live, frame):
             if state.live is None:
                 self._starting.begin_again()
             elif state.lost:
@@ -439,7 +437,7 @@ class System:
         # A graph that has failed, and a map of the pixels of before, are not found again.
         may_return = failure.reason is not FailureReason.SOLVER and state.parts.shutter.readout_s == readout_s
         if start or not may_return or self._has_waited(view):
-            self._endings.give_up(live, view, failure, may_return)
+            self._endings.give_up(live, view, failure)
             state.lost = []
         return failure if isinstance(start, Failure) else self._begin(start, view)
 

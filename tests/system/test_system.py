@@ -303,11 +303,12 @@ def test_a_lost_map_that_is_seen_again_before_another_starts_is_gone_on_with() -
     world = turning_back(25)
     system = run(world, recovery={"enabled": True})
     (relocalised,) = system.events.of_kind(EventKind.RELOCALISED)
-    assert relocalised.frame == 25 + 25 + 1, "two frames must show it"
+    assert relocalised.frame == 25 + 25 + 2, "three frames must show it"
     assert len(system.atlas.submaps) == 1
     assert [k for k in kinds(system) if k in (EventKind.FAILED, EventKind.REINITIALISED)] == [EventKind.FAILED]
     indices, T = main_trajectory(system)
     assert [i for i in range(70) if i not in indices] == list(range(25, 50)), "the first frame is tracked back to"
+    assert system._state.record.observations.keys() >= {50, 51, 52}, "frames that confirm the place can be posed again"
     assert_right(indices[5:], T[5:], world)
     assert system.rows[69].status is FrameStatus.TRACKED
 

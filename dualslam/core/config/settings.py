@@ -170,9 +170,9 @@ class RecoveryConfig(StrictModel):
     """In this order, each from the same snapshot of the new map, until one leads to a link. A list of words will do,
     such as `[gap, live, sift]`; an attempt with settings is written `{frontend: sift, n_features: 3000}`."""
     relocalise_after: int | None = Field(15, ge=0)
-    """Frames with content but without a start, after which the lost map is searched for and, if revisited, continued.
-    null: never. A new map that starts sooner is better linked by reverse tracking, and most start within 2 to 5 frames.
-    Where the camera turns in place none can start, but it may come back to the lost map."""
+    """Frames with content but without a start, after which a map that they show is searched for and continued (if
+    `places.enabled`). null: never. A new map that starts sooner is better linked by reverse tracking, and most start
+    within 2 to 5 frames. Where the camera turns in place none can start, but it may come back to a lost map."""
     retry_keyframes: tuple[Annotated[int, Field(ge=1)], ...] = (5, 15)
     """Keyframes of the new map at which the first attempt is repeated if none has found a link, or left buffered frames
     without a pose. The map then knows depths better, and more of the scene. It is also repeated after a calibration. If

@@ -90,10 +90,10 @@ class Calibrations:
         self.collect(live, now)
 
     def collect(self, live: VisualOdometry | None, now: FrameStamp, wait: bool = False) -> bool:
-        """Take in the answers; `live` continues in its submap as it is after that.
+        """Take in the answers; `live` continues in its submap as it is after that. While none is live, the last one
+        that was lost changes.
 
-        It may be the front end that looks for a submap which was lost since it was asked. Returns whether the frames to
-        come have another camera. `wait`: for a limited time, for what is open.
+        Returns whether the frames to come have another camera. `wait`: for a limited time, for what is open.
         """
         before, desk = self._calibration.camera, self._desk
         for ended in desk.drain(JobKind.CALIBRATION) if wait else desk.poll(JobKind.CALIBRATION):
@@ -118,24 +118,26 @@ class Calibrations:
         self, job: CalibrationJob, answer: CalibrationAnswer, live: VisualOdometry | None, now: FrameStamp
     ) -> list[int] | Failure:
         """Return the lost submaps that have changed, too."""
-        if live is None or live.submap.id != job.submap.id:
-            # What lives now was made with the camera of before, and would be left apart from all that changes.
+        submaps = self._record.atlas.submaps
+        if job.submap.id != (max(submaps) if live is None else live.submap.id):
+            # What came after was made with the camera of before, and would be left apart from all that changes.
             return Failure(FailureReason.DISABLED, "the submap that was asked is live no more", answer.numbers)
-        graph = self._new_graph()
+        submap, graph = submaps[job.submap.id], self._new_graph()
         try:
-            merged = merge_calibrated(live.submap, job.submap, answer)
+            merged = merge_calibrated(submap, job.submap, answer)
             merged.apply_estimate(*graph.rebuild(merged, near_optimum=True).values)
         except (InputError, SolverError) as error:
             return Failure(FailureReason.SOLVER, str(error), answer.numbers)
         self._calibration.take(answer)
-        before = live.submap.copy()
-        live.submap.take_over(merged)
-        live.adopt(graph, before)
+        before = submap.copy()
+        submap.take_over(merged)
+        if live is not None:
+            live.adopt(graph, before)
         self._buffer.map_later(self._calibration.rectified, "camera")
-        self._connections.follow(before, live.submap, now)
+        self._connections.follow(before, submap, now)
         changed = [m for m in self._recoveries.waiting if self._change_lost(m, job, answer, now)]
         rectified = partial(rectified_where_possible, camera=answer.camera)
-        for m in (live.submap.id, *changed):
+        for m in (submap.id, *changed):
             self._record.change_pixels(m, lambda _: rectified)
         return changed
 
