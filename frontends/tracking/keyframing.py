@@ -22,11 +22,9 @@ from dualslam.map.submap import NO_LANDMARK, Submap
 
 MIN_PARALLAX_DEG = 0.5
 """...and the camera has moved enough to see the scene's median depth under this angle (or tracking is weak)."""
-MAX_TRACKED_RATIO = 0.6
-"""A keyframe is due when a smaller share of the last one's landmarks is still tracked."""
-USUAL_REPEATABILITY = 0.82
-"""`Repeatability` from which on that holds: the least of ORB in four sequences. A front end that finds less of what is
-there shows less of the last keyframe, in proportion, although as much is left of it."""
+MAX_TRACKED_RATIO, USUAL_REPEATABILITY = 0.6, 0.82
+"""A keyframe is due when a smaller share of the last one's landmarks is still tracked. It may be smaller, in
+proportion, with a `Repeatability` below ORB's least in four sequences: as much is left then, and less of it found."""
 MAX_FRAMES = 30
 """Frames after which one is due if the camera has moved at all."""
 FULL_PARALLAX_DEG, LEAST = 1.4, 0.6
