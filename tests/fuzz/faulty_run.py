@@ -85,6 +85,7 @@ def run(kind: str, seed: int, cpu_s: float, source: str, out: str) -> int:
     at_s = rng.uniform(0.0, cpu_s)
     dualslam.run.session.SAVE_S, dualslam.run.session.SAVING_SHARE = SAVE_S, float("inf")
     report_frames()
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell may have told its background not to mind it
     if kind in SIGNALS:
         happen_at(at_s, lambda: os.kill(os.getpid(), SIGNALS[kind]))
     elif kind == "full_disk":
