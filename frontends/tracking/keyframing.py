@@ -183,8 +183,8 @@ def passes_unmapped(
 
     - `track`: of a frame.
     - `keyframe_id`: of the submap: the last keyframe.
-    - `parallax_deg`: at which a keyframe is due if what is mapped shows it. At the angle from which on a match could be
-      a landmark, 1 degree, keyframes came in turns on the spot as well, and broke maps of `tum_fr1_rpy`.
+    - `parallax_deg`: at which a keyframe is due if what is mapped shows it. From 1 degree on a match could be a
+      landmark, but with that, keyframes came in turns on the spot as well. They broke maps of `tum_fr1_rpy`.
     - `n`: so many matches must show it.
     """
     features, keyframe = track.view.features, submap.keyframes[keyframe_id].features
