@@ -16,15 +16,14 @@ from dualslam.core.geometry.projection import MIN_DEPTH
 from dualslam.core.interfaces import Frontend
 from dualslam.core.noise_model import PROOF_VIEWS
 from dualslam.core.quantiles import median
-from dualslam.core.types import BoolArray, Failure, Features, FloatArray, FrameMethod, IntArray, Track
+from dualslam.core.types import BoolArray, Features, FloatArray, IntArray, Track
 from dualslam.frontends.tracking.turning import unit_rays
 from dualslam.map.submap import NO_LANDMARK, Submap
 
 MIN_PARALLAX_DEG = 0.5
 """...and the camera has moved enough to see the scene's median depth under this angle (or tracking is weak)."""
-MAX_TRACKED_RATIO, USUAL_REPEATABILITY = 0.6, 0.82
-"""A keyframe is due when a smaller share of the last one's landmarks is still tracked. It may be smaller, in
-proportion, with a `Repeatability` below ORB's least in four sequences: as much is left then, and less of it found."""
+MAX_TRACKED_RATIO = 0.6
+"""A keyframe is due when a smaller share of the last one's landmarks is still tracked."""
 MAX_FRAMES = 30
 """Frames after which one is due if the camera has moved at all."""
 FULL_PARALLAX_DEG, LEAST = 1.4, 0.6
@@ -40,48 +39,11 @@ LEAST_HOLD = 0.5
 more than half keyframes come a tenth more often there."""
 
 
-class Repeatability:
-    """Share of the landmarks in a frame that the front end finds there, measured along a map.
-
-    What the frames before and after a frame show is there in it, too. No front end finds all of that, and what one
-    misses has neither left the image nor changed.
-    """
-
-    def __init__(self) -> None:
-        self._last: list[IntArray] = []  # landmarks of the last two frames
-        self._n_there = self._n_found = 0
-
-    @property
-    def share(self) -> float:
-        """Of all frames so far; 1 before three frames in a row were tracked."""
-        return self._n_found / self._n_there if self._n_found else 1.0
-
-    def note(self, track: Track | Failure) -> None:
-        """Take in the next frame."""
-        if isinstance(track, Failure) or track.method is FrameMethod.DIRECT:
-            self._last = []
-            return
-        if len(self._last) == 2:
-            before, between = self._last
-            there = before[np.isin(before, track.seen_ids)]
-            self._n_there += len(there)
-            self._n_found += int(np.isin(there, between).sum())
-        self._last = [*self._last[-1:], track.seen_ids]
-
-
-def keyframe_due(
-    track: Track,
-    submap: Submap,
-    reference_id: int,
-    config: KeyframeConfig,
-    first_id: int = 0,
-    repeatability: float = 1.0,
-) -> Ruling:
-    """Decide by what is still there of the last keyframe and by how far the camera has moved since.
+def keyframe_due(track: Track, submap: Submap, reference_id: int, config: KeyframeConfig, first_id: int = 0) -> Ruling:
+    """Decide by what is still tracked of the last keyframe and by how far the camera has moved since.
 
     - `reference_id`: the last keyframe, in the direction in which the frames come.
     - `first_id`: number of this run's first frame: how long ago another run was says nothing.
-    - `repeatability`: `Repeatability.share`.
     """
     if track.view.index in submap.keyframes:
         return Ruling(False, detail="it is one already")
@@ -95,7 +57,6 @@ def keyframe_due(
         # A few near ones hold the position, like a bench that a camera takes off from: while they leave, the many far
         # ones are still in view, and a keyframe that came when these change would find the scale already lost.
         share = min(share, _share_in(track.landmark_ids, submap, reference_id, by_hold=True) / LEAST_HOLD)
-    share /= min(repeatability / USUAL_REPEATABILITY, 1.0)
     gates = _shows_other(share, parallax, n_frames, config)
     return Ruling(any(gate.passed for gate in gates), (weak, *gates))
 

@@ -19,7 +19,7 @@ from dualslam.core.interfaces import N_WINDOW, Frontend, SubmapGraph, WindowSolv
 from dualslam.core.types import Failure, FailureReason, FloatArray, FrameMethod, IntArray, Rival, Track, View
 from dualslam.frontends.gap.refinding import Refinder
 from dualslam.frontends.gap.uncertainty import track_uncertainty
-from dualslam.frontends.tracking.keyframing import Repeatability, keyframe_due, keyframe_like, passes_unmapped
+from dualslam.frontends.tracking.keyframing import keyframe_due, keyframe_like, passes_unmapped
 from dualslam.frontends.tracking.mapper import Mapper
 from dualslam.frontends.tracking.patch_alignment import PatchAlignment
 from dualslam.frontends.tracking.pixel_search import PixelSearch
@@ -82,7 +82,6 @@ class VisualFrontEnd:
         self._window = window
         self._alignment = None if refinder is None else PatchAlignment(refinder.images, refinder.camera)
         self._first_id = first_id
-        self._repeatability = Repeatability()
         self._careful = True  # the next keyframe is the graph's to pose
         self._after_gap = False
         self._apart: frozenset[int] = frozenset()  # keyframes across the last gap, where few landmarks bridge it
@@ -150,7 +149,6 @@ class VisualFrontEnd:
 
     def _noted(self, view: View, track: Track | Failure) -> Track | Failure:
         self._note_gap(track)
-        self._repeatability.note(track)
         if track and view.index in self.submap.keyframes:
             self._meet(view.index)
         return track
@@ -244,8 +242,7 @@ class VisualFrontEnd:
     def _shows_other(self, track: Track) -> Ruling:
         """Whether a frame shows other things than its reference keyframe, or from elsewhere."""
         config, last = self._config, self._reference_id
-        found = self._repeatability.share
-        ruling = keyframe_due(track, self.submap, last, config.keyframes, self._first_id, found)
+        ruling = keyframe_due(track, self.submap, last, config.keyframes, self._first_id)
         if ruling or track.view.index in self.submap.keyframes:
             return ruling
         parallax_deg, n = config.keyframes.max_parallax_deg, config.tracking.min_inliers

@@ -17,7 +17,7 @@ from dualslam.core.estimates import KeyframeReport
 from dualslam.core.geometry import se3, sim3
 from dualslam.core.types import Failure, FailureReason, FloatArray, IntArray, Keyframe, Track, View
 from dualslam.frontends.features.orb import OrbFrontend
-from dualslam.frontends.tracking.keyframing import Repeatability, keyframe_due, keyframe_like, parallax_deg
+from dualslam.frontends.tracking.keyframing import keyframe_due, keyframe_like, parallax_deg
 from dualslam.frontends.tracking.local_map import LocalMap
 from dualslam.frontends.tracking.mapper import Mapper, spread_choice
 from dualslam.frontends.tracking.resection import estimate_pose, resect
@@ -427,29 +427,6 @@ class TestKeyframing:
                 if 0.5 < parallax < 1.0 or 1.5 < parallax < config.max_parallax_deg:
                     due[parallax < 1.0].add(bool(keyframe_due(shown, live.submap, 8, config)))
             assert due == {True: {with_little}, False: {with_much}}, share
-
-    def test_repeatability_is_the_share_of_what_is_there_that_is_found(self, world: PointWorld) -> None:
-        """A tenth of the landmarks leaves from frame to frame. That is no miss of the front end."""
-        track = tracked(front_end(world, [0, 4, 8], start_at=8), world.view(9))
-        rng, repeatability = np.random.default_rng(0), Repeatability()
-        assert repeatability.share == 1.0
-        for i in range(30):
-            there = np.arange(50 * i, 50 * i + 500)
-            repeatability.note(replace(track, landmark_ids=there[rng.random(500) < 0.7]))
-            if i % 10 == 9:
-                repeatability.note(Failure(FailureReason.TOO_FEW_INLIERS, "lost"))
-        assert repeatability.share == pytest.approx(0.7, abs=0.02)
-
-    def test_what_a_front_end_misses_is_not_lost(self, world: PointWorld) -> None:
-        live = front_end(world, [0, 4, 8], start_at=8)
-        seen = live.submap.landmark_of[8]
-        seen = seen[(seen >= 0) & (live.submap.n_observations(seen) >= 3)]
-        tracks = (tracked(live, world.view(i)) for i in range(9, 20))
-        track = next(each for each in tracks if 1.5 < parallax_deg(each, live.submap, 8) < 4)
-        shown = replace(track, landmark_ids=seen[: len(seen) // 2])
-        config = KeyframeConfig(weak_landmarks=10)
-        assert keyframe_due(shown, live.submap, 8, config)
-        assert not keyframe_due(shown, live.submap, 8, config, repeatability=0.6)
 
     def test_a_few_near_landmarks_that_leave_make_one_before_the_scale_is_lost(self, world: PointWorld) -> None:
         """As a bench does at a take-off."""
