@@ -178,7 +178,7 @@ def as_by_a_user() -> Iterator[tuple[io.StringIO, io.StringIO]]:
         yield out, err
 
 
-def tried(kind: str, seed: int, templates: Path, work: Path) -> tuple[int, str | None]:
+def tried(kind: str, seed: int, work: Path, templates: Path) -> tuple[int, str | None]:
     """Make one case in a new folder; return the exit status, and what is wrong with what the command did or None."""
     work.mkdir()
     command = KINDS[kind](templates, work, np.random.default_rng([seed, list(KINDS).index(kind)]))

@@ -1,21 +1,18 @@
-"""What happens to a run from outside, by seed: a run is killed, its disk is full, its solver fails. It loses nothing.
+"""`make faults`: what happens to a run, by seed: it is killed, its disk is full, its solver fails. It loses nothing.
 
-`python -m tests.fuzz.faults --cases 1000` makes many. A loss is printed with the kind and seed that repeat it.
-Times are CPU times of the process, so a repetition is alike and not the same.
+A loss is printed with the kind and seed that repeat it. Times are CPU times of the process, so a repetition is alike
+and not the same.
 """
 
 from __future__ import annotations
 
-import argparse
 import json
 import resource
-import shutil
 import signal
 import subprocess
 import sys
-import tempfile
-from collections import Counter
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -31,6 +28,7 @@ from dualslam.lab.synthetic import render_to_folder
 from dualslam.report import read_run
 from dualslam.run.sources import parse_world
 from tests.fuzz.faulty_run import KINDS, SAVE_S
+from tests.fuzz.many import Trial, make_many
 
 BLACK = slice(36, 43)
 """Frames of a street: a map is lost there, another begins, and both are joined."""
@@ -73,19 +71,8 @@ class Bench:
         for name in np.array(sorted((source / "images").iterdir()))[BLACK]:
             cv2.imwrite(str(name), np.zeros((240, 320), np.uint8))
         before = resource.getrusage(resource.RUSAGE_CHILDREN)
-        run = subprocess.run(
-            [
-                sys.executable,
-                "-m",
-                "dualslam",
-                "run",
-                str(source),
-                "--out",
-                str(folder / "sound"),
-                "--quiet",
-                "--inline",
-            ]
-        )
+        command = [sys.executable, "-m", "dualslam", "run", str(source), "--out", str(folder / "sound")]
+        run = subprocess.run([*command, "--quiet", "--inline"])
         after = resource.getrusage(resource.RUSAGE_CHILDREN)
         assert run.returncode == 0
         is_posed = [row.in_main_map for row in read_frames(folder / "sound" / FRAMES)]
@@ -96,7 +83,7 @@ class Bench:
         return int(self.is_posed[: min(n_frames, BLACK.start) if n_frames < len(self.is_posed) else n_frames].sum())
 
 
-def tried(kind: str, seed: int, bench: Bench, out: Path) -> tuple[int, str | None]:
+def tried(kind: str, seed: int, out: Path, bench: Bench) -> tuple[int, str | None]:
     """Make one case; return its exit status, and what is wrong with what it said and left, or None."""
     command = [sys.executable, "-m", "tests.fuzz.faulty_run", kind, str(seed), str(bench.cpu_s)]
     done = subprocess.run([*command, str(bench.source), str(out)], capture_output=True, text=True, timeout=300)
@@ -135,29 +122,9 @@ def _lost(status: int, progress: str, out: Path, bench: Bench) -> str | None:
     return None
 
 
-def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--cases", type=int, default=200)
-    parser.add_argument("--seed", type=int, default=0, help="of the first case of each kind; the next has the next")
-    parser.add_argument("--kind", choices=KINDS, nargs="+", default=list(KINDS))
-    args = parser.parse_args()
-    ends, faults = Counter[tuple[str, int]](), Counter[str]()
-    with tempfile.TemporaryDirectory() as folder:
-        bench = Bench.build(Path(folder))
-        for i in range(args.cases):
-            kind, seed = args.kind[i % len(args.kind)], args.seed + i // len(args.kind)
-            out = Path(folder) / "run"
-            status, fault = tried(kind, seed, bench, out)
-            ends[kind, status] += 1
-            faults[kind] += fault is not None
-            shutil.rmtree(out, ignore_errors=True)
-            if fault is not None:
-                print(f"{kind} --seed {seed}: {fault}", flush=True)
-    for kind in args.kind:
-        n_each = ", ".join(f"{n} ended with {s}" for (k, s), n in sorted(ends.items()) if k == kind)
-        print(f"{kind}: {n_each}; {faults[kind]} lost something")
-    return int(faults.total() > 0)
+def prepare(folder: Path) -> Trial:
+    return partial(tried, bench=Bench.build(folder))
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(make_many("faults", str(__doc__), KINDS, 200, prepare))

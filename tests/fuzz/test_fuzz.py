@@ -21,7 +21,7 @@ def templates(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.parametrize("kind", KINDS)
 def test_what_is_sound_is_read(kind: str, templates: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("tests.fuzz.campaign.spoil", lambda path, rng: None)
-    made = [tried(kind, seed, templates, tmp_path / str(seed)) for seed in range(6)]
+    made = [tried(kind, seed, tmp_path / str(seed), templates) for seed in range(6)]
     assert 2 not in dict(made)
     assert not [fault for _, fault in made if fault is not None]
 
@@ -29,6 +29,6 @@ def test_what_is_sound_is_read(kind: str, templates: Path, tmp_path: Path, monke
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_damaged_input_costs_a_sentence(kind: str, templates: Path, tmp_path: Path) -> None:
-    made = [tried(kind, seed, templates, tmp_path / str(seed)) for seed in [*range(N_CASES[kind]), *KEPT.get(kind, [])]]
+    made = [tried(kind, seed, tmp_path / str(seed), templates) for seed in [*range(N_CASES[kind]), *KEPT.get(kind, [])]]
     assert not [fault for _, fault in made if fault is not None]
     assert 2 in dict(made), "some of the damage is found"
