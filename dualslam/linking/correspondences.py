@@ -12,7 +12,7 @@ from dualslam.core.columns import concatenate
 from dualslam.core.firsts import is_first
 from dualslam.core.types import BoolArray, Features, FloatArray, IntArray
 from dualslam.map.landmark_views import landmark_covariances, triangulate_landmarks
-from dualslam.map.submap import Submap
+from dualslam.map.submap import NO_LANDMARK, Submap
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,6 +117,13 @@ def match_landmarks(old: Submap, new: Submap, matcher: DescriptorMatcher | None)
     (landmark_old, landmark_new), pair_of_vote = _one_to_one(votes, len(new.landmarks))
     covariance_new = landmark_covariances(new, landmark_new)
     return MatchedLandmarks(votes, landmark_old, landmark_new, pair_of_vote, covariance_new)
+
+
+def landmarks_shown_in(old: Submap, new: Submap) -> IntArray:
+    """Return for each landmark of the new map (L,) the one that it is by identity in the old one, or `NO_LANDMARK`."""
+    matched, id_of = match_landmarks(old, new, None), np.full(len(new.landmarks), NO_LANDMARK, np.int64)
+    id_of[matched.landmark_new] = matched.landmark_old
+    return new.by_heirs(id_of)
 
 
 def place_pairs(old: Submap, new: Submap, matched: MatchedLandmarks, old_before: int | None) -> Correspondences:

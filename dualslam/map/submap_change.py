@@ -1,4 +1,4 @@
-"""How two submaps, or two states of one, lie to each other: what was posed in the one follows into the other."""
+"""How a submap has moved between two states of it, as a similarity: what was posed in the old one follows by it."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from collections.abc import Iterable
 import numpy as np
 
 from dualslam.core.geometry import se3, sim3, so3
-from dualslam.core.types import FloatArray, IntArray
-from dualslam.map.submap import NO_LANDMARK, Submap
+from dualslam.core.types import FloatArray
+from dualslam.map.submap import Submap
 
 
 def change_of_frame(
@@ -37,18 +37,6 @@ def change_of_frame(
     scale = float(np.median(together)) if len(together) else 1.0
     t = (T_after[:, :3, 3] - scale * T_before[:, :3, 3] @ R.T).mean(0)
     return sim3.from_parts(scale, R, t)
-
-
-def landmarks_shown_in(submap: Submap, other: Submap) -> IntArray:
-    """Return for each landmark of another submap (L,) the one that keyframes in both show, or `NO_LANDMARK`."""
-    id_of = np.full(len(other.landmarks), NO_LANDMARK, np.int64)
-    for k in sorted(submap.keyframes.keys() & other.keyframes.keys()):
-        n = other.keyframes[k].features.n_common(submap.keyframes[k].features)
-        here, there = submap.landmark_of[k][:n], other.landmark_of[k][:n]
-        both = (here != NO_LANDMARK) & (there != NO_LANDMARK)
-        id_of[there[both]] = here[both]
-    now = other.current_ids(np.arange(len(id_of)))
-    return np.where(now != NO_LANDMARK, id_of[now], NO_LANDMARK)
 
 
 def _depth_ratios(before: Submap, after: Submap, k: int, n: int) -> FloatArray:

@@ -17,11 +17,11 @@ from dualslam.core.events import EventKind
 from dualslam.core.memory import MB
 from dualslam.core.noise_model import MAX_TRIES, PROOF_VIEWS
 from dualslam.core.types import FailureReason, FrameMethod, FrameStatus, View
+from dualslam.linking.correspondences import landmarks_shown_in
 from dualslam.linking.motion import find_reached
 from dualslam.linking.scale_observability import position_sigmas
 from dualslam.map.frame_observations import FrameObservations
 from dualslam.map.submap import Submap
-from dualslam.map.submap_change import landmarks_shown_in
 from dualslam.recovery.registration import REACH, Registration
 from dualslam.system.state import State
 

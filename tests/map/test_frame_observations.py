@@ -13,11 +13,11 @@ from dualslam.atlas.record import MAX_OBSERVED, Record
 from dualslam.atlas.trajectory import FramePose
 from dualslam.core.geometry import se3
 from dualslam.core.types import Features, FrameStatus
+from dualslam.linking.correspondences import landmarks_shown_in
 from dualslam.map.frame_observations import FrameObservations
 from dualslam.map.frame_records import FrameRow
 from dualslam.map.split import submap_of
 from dualslam.map.submap import NO_LANDMARK, Submap
-from dualslam.map.submap_change import landmarks_shown_in
 from dualslam.testing.graph_scene import guessed_submap, make_features, make_scene
 
 N, FRAME = 8, 100
