@@ -39,6 +39,10 @@ class Claim:
     stretch: by how much it may be too large or too small. Infinite where nothing ties it to that one."""
 
 
+Claims = dict[int, dict[int, Claim]]
+"""By submap and keyframe."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class _Known:
     """What a submap knows of its keyframes, and of the scales about them and at its links against each other."""
@@ -62,12 +66,12 @@ class _Known:
         return dict(zip(self.sigma_position_rel, known, strict=True))
 
 
-def claims_in_atlas(atlas: Atlas) -> dict[int, dict[int, Claim]]:
-    """Return the claims of all submaps."""
-    return {m: own for linked in atlas.components() for m, own in claims_in(atlas, linked).items()}
+def claims_in_atlas(atlas: Atlas) -> Claims:
+    """Return the claims of all submaps, which takes seconds."""
+    return {m: own for linked in atlas.components() for m, own in _claims_in(atlas, linked).items()}
 
 
-def claims_in(atlas: Atlas, linked: Collection[int]) -> dict[int, dict[int, Claim]]:
+def _claims_in(atlas: Atlas, linked: Collection[int]) -> Claims:
     """Return the claims of submaps that are linked, with their scales against the best-tied stretch of them all.
 
     It is in the largest submap. Along the best links to it, variances add: of each link, and between the links' places.

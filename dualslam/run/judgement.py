@@ -14,7 +14,7 @@ from dualslam.core.trajectory import Trajectory
 from dualslam.core.types import Failure, FrameStatus
 from dualslam.map.frame_records import FrameRow
 from dualslam.run.camera_judgement import MAX_PATH_CHANGE, judge_camera
-from dualslam.run.claims import claims_in
+from dualslam.run.claims import Claims, claims_in_atlas
 from dualslam.run.measuring import MANY_REJECTED, Measured
 from dualslam.run.results import Trajectories
 from dualslam.system.audit.photometric import Disagreement, Sample, find_disagreement
@@ -44,6 +44,7 @@ def judge_run(
     crashed: bool = False,
     measured: Measured | None = None,
     besides: Iterable[Reason] = (),
+    claims: Claims | None = None,
 ) -> Verdict:
     """Judge a run that has ended.
 
@@ -51,6 +52,7 @@ def judge_run(
     - `rows`: of `frame_rows`: one for each frame of the source.
     - `measured`: the run in the frame of measurements from outside.
     - `besides`: what is known against it already.
+    - `claims`: those of `claims_in_atlas`, if they are there already.
     """
     if not rows:
         return Verdict(Level.DOUBTFUL)
@@ -62,7 +64,7 @@ def judge_run(
         steps, found = _steps(system, trajectories), find_disagreement(_held_samples(system, trajectories))
         reasons += [*_jumps(system, trajectories, *steps), *_photometric(system, found), *_scale(rows)]
         reasons += [*_loose_joins(system, trajectories), *_still(system, trajectories)]
-        reasons += _replaced(system, trajectories)
+        reasons += _replaced(system, trajectories, claims)
         camera, scores = judge_camera(system)
         reasons += [] if camera is None else [_about_all(rows, *camera)]
         scores |= {
@@ -240,7 +242,7 @@ def _loose_joins(system: System, trajectories: Trajectories) -> list[Reason]:
     return [Reason(ReasonCode.SCALE, Level.USABLE, text, first, last)]
 
 
-def _replaced(system: System, trajectories: Trajectories) -> list[Reason]:
+def _replaced(system: System, trajectories: Trajectories, claims: Claims | None) -> list[Reason]:
     """Find frames that the main map has taken from another one whose path it contradicts: one is wrong.
 
     Where the other map does not know its own scale, it contradicts nothing.
@@ -250,8 +252,8 @@ def _replaced(system: System, trajectories: Trajectories) -> list[Reason]:
         index_of = {system.numbers.index_of(k): k for k in sorted(earlier.keyframes.keys() - earlier.condemned)}
         index = [i for i in index_of if i in centres]
         if len(index) >= MIN_COMPARED:
-            known = claims_in(system.atlas, system.atlas.component_of(earlier.id))[earlier.id]
-            index = [i for i in index if not known[index_of[i]].sigma_scale > UNSURE_SCALE]
+            claims = claims_in_atlas(system.atlas) if claims is None else claims
+            index = [i for i in index if not claims[earlier.id][index_of[i]].sigma_scale > UNSURE_SCALE]
         if len(index) < MIN_COMPARED:
             continue
         was = earlier.keyframe_poses(np.array([index_of[i] for i in index]))[:, :3, 3]

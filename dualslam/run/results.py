@@ -24,7 +24,7 @@ from dualslam.core.types import FloatArray
 from dualslam.io.run_folder import FrameRow
 from dualslam.io.trajectory_files import MAX_DT_S, Trajectory, associate
 from dualslam.lab.metrics.trajectory_metrics import score_trajectory
-from dualslam.run.claims import Claim, claims_in_atlas
+from dualslam.run.claims import Claims, claims_in_atlas
 from dualslam.run.runner import RunReport
 from dualslam.system.audit.verdict import Verdict
 from dualslam.system.system import System
@@ -72,8 +72,7 @@ def frame_rows(
     system: System,
     main: Trajectory | None = None,
     latencies_ms: Mapping[int, float] | None = None,
-    *,
-    with_claims: bool = True,
+    claims: Claims | None = None,
 ) -> list[FrameRow]:
     """Return a row for every frame of the source, in the order in which they came: those of ``frames.csv``.
 
@@ -86,11 +85,12 @@ def frame_rows(
         That of `trajectories_of`, if it is there already.
     latencies_ms : mapping of int to float, optional
         Of the frames that were tracked, by their index, as the harness measured them. Else that of their steps.
-    with_claims : bool
-        Fill the columns ``sigma_*``, which takes seconds.
+    claims : Claims, optional
+        For the columns ``sigma_*``: those of `claims_in_atlas`, if they are there already. Without any, {}, they are
+        empty.
     """
     in_main = set((trajectories_of(system).main if main is None else main).index.tolist())
-    claims = claims_in_atlas(system.atlas) if with_claims else {}
+    claims = claims_in_atlas(system.atlas) if claims is None else claims
     return [
         replace(
             _with_claim(system, row, claims),
@@ -103,7 +103,7 @@ def frame_rows(
     ]
 
 
-def _with_claim(system: System, row: FrameRow, claims: Mapping[int, Mapping[int, Claim]]) -> FrameRow:
+def _with_claim(system: System, row: FrameRow, claims: Claims) -> FrameRow:
     """Return a frame's row with what the map claims of the keyframe that it hangs on."""
     pose = system.poses.get(row.index)
     if pose is None or not claims:

@@ -40,6 +40,7 @@ from dualslam.io.video import WebcamSequence
 from dualslam.lab.disturbances import corrupted
 from dualslam.map.frame_records import FrameResult
 from dualslam.report import PlaceAlbum, SampleKeeper, read_run, report_page
+from dualslam.run.claims import claims_in_atlas
 from dualslam.run.front_end import with_frontend_chosen
 from dualslam.run.interrupts import Interrupts
 from dualslam.run.judgement import judge_run
@@ -445,8 +446,10 @@ def _write_results(
         trajectories = trajectories_of(system)
     dropped = set(report.dropped)
     looked_at = [i for i in map(system.numbers.index_of, system.rows) if i not in dropped]
-    rows = frame_rows(system, trajectories.main, dict(zip(looked_at, report.latencies_ms, strict=False)))
-    verdict = judge_run(system, trajectories, rows, crashed=report.bug is not None, measured=measured, besides=reasons)
+    claims = claims_in_atlas(system.atlas)
+    rows = frame_rows(system, trajectories.main, dict(zip(looked_at, report.latencies_ms, strict=False)), claims)
+    crashed = report.bug is not None
+    verdict = judge_run(system, trajectories, rows, crashed, measured, reasons, claims)
     rows = [replace(row, doubt=verdict.doubt_about(row.index)) for row in rows]
     truth: Trajectory | None = getattr(sequence, "ground_truth", None)
     summary = (
@@ -527,7 +530,7 @@ class _PosesSoFar:
             self._writing = self._thread.submit(self._write, trajectories_of(self._system), time.monotonic())
 
     def _write(self, found: Trajectories, began_s: float) -> None:
-        rows = frame_rows(self._system, found.main, with_claims=False)
+        rows = frame_rows(self._system, found.main, claims={})
         self._folder.write_poses(RunRecord(rows, found.main, found.unlinked))
         ended_s = time.monotonic()
         self._due_s = ended_s + max(SAVE_S, (ended_s - began_s) / SAVING_SHARE)

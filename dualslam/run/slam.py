@@ -26,6 +26,7 @@ from dualslam.io.masks import read_mask
 from dualslam.io.times import UNIT_NAMES, epoch_unit
 from dualslam.map.frame_records import FrameResult
 from dualslam.report.run_data import RunData, read_run
+from dualslam.run.claims import claims_in_atlas
 from dualslam.run.front_end import with_frontend_chosen
 from dualslam.run.judgement import judge_run
 from dualslam.run.results import frame_rows, trajectories_of
@@ -147,8 +148,9 @@ class Slam:
     @property
     def verdict(self) -> Verdict:
         """How far to trust the map so far: `level` (good, usable, doubtful) and `reasons`."""
-        trajectories = trajectories_of(self.system)
-        return judge_run(self.system, trajectories, frame_rows(self.system, trajectories.main))
+        trajectories, claims = trajectories_of(self.system), claims_in_atlas(self.system.atlas)
+        rows = frame_rows(self.system, trajectories.main, claims=claims)
+        return judge_run(self.system, trajectories, rows, claims=claims)
 
     def finish(self) -> None:
         """End the mapping: wait for running recoveries, refine. No image is taken after it; `save` calls it."""

@@ -11,6 +11,7 @@ from dualslam.atlas.atlas import Link, LinkKind
 from dualslam.core.events import EventKind
 from dualslam.core.types import FloatArray, Frame, Keyframe
 from dualslam.map.submap import Submap
+from dualslam.run.claims import claims_in_atlas
 from dualslam.run.judgement import judge_run
 from dualslam.run.results import frame_rows, trajectories_of
 from dualslam.system.audit.photometric import MIN_SAMPLES, Sample
@@ -160,8 +161,10 @@ def test_a_map_that_does_not_know_its_own_scale_contradicts_nothing() -> None:
             earlier.T_submap_kf[k][:3, 3] += 0.5 * (earlier.T_submap_kf[k][:3, 3] - centre)
     earlier.landmarks["xyz_mu"][seen_late] += 0.5 * (earlier.landmarks["xyz_mu"][seen_late] - centre)
     system.atlas.add(earlier)
-    verdict = judge_run(system, trajectories_of(system), frame_rows(system))
+    trajectories, claims = trajectories_of(system), claims_in_atlas(system.atlas)
+    verdict = judge_run(system, trajectories, frame_rows(system, claims=claims), claims=claims)
     assert verdict.level is Level.GOOD
+    assert judge_run(system, trajectories, frame_rows(system)) == verdict
 
 
 def test_a_camera_that_hung_has_not_jumped() -> None:
