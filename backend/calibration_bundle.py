@@ -90,7 +90,7 @@ class _HeldLens(CorrectedLens):
 def optimise_with_camera(
     problem: BundleProblem, start: FloatArray, prior: FloatArray, robust_k: float
 ) -> CalibratedOptimum:
-    """Minimise over poses, points and correction, without the few points that a step has put behind a camera.
+    """Minimise over poses, points and correction, without the few points that end behind a camera.
 
     - `problem`: in the rectified pixels of the camera as it was given; `fixed` is not looked at.
     - `start`, `prior` (5,): the correction to begin at, and the prior sigmas of its parts about zero.
@@ -121,13 +121,10 @@ def _poses_under(problem: BundleProblem, robust_k: float, correction: FloatArray
 
 
 def _in_front(problem: BundleProblem, robust_k: float, lens: Lens, start: FloatArray) -> tuple[BundleProblem, Optimum]:
-    """Minimise, and again without the points that a step has put behind a camera; return what is left, and its optimum.
-
-    Behind a camera a point counts for nothing: where it fits nowhere else, it moves no other variable.
-    """
+    """Minimise, and again without the points that are behind a camera; return what is left, and its optimum."""
     p, loss = problem, partial(huber, k=robust_k)
     for _ in range(MAX_TRIES + 1):
-        found = optimise(p, loss, MAX_ITERATIONS, TOLERANCE, lens, start, behind_chi2=0.0)
+        found = optimise(p, loss, MAX_ITERATIONS, TOLERANCE, lens, start)
         T, xyz = found.state.T_submap_kf, found.state.xyz_mu
         depth = np.einsum("ri,ri->r", T[p.kf, :3, 2], xyz[p.point] - T[p.kf, :3, 3])
         behind = np.unique(p.point[depth <= MIN_DEPTH_MU])

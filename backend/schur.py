@@ -34,7 +34,8 @@ observation; more are linearised twice."""
 FIRST_DAMPING, DAMPING_FACTOR, LEAST_DAMPING, MOST_DAMPING = 1e-5, 10.0, 1e-8, 1e10
 """Levenberg-Marquardt, added to the diagonal."""
 BEHIND_CHI2 = 1e6
-"""What a view of a point behind its camera counts as, by default: the loss is large, and the weight none."""
+"""What a view of a point behind its camera counts as: the loss is large, and the weight none. Were it small, cameras
+would fit best that have turned away from all points."""
 
 
 class Lens(Protocol):
@@ -110,7 +111,6 @@ def optimise(
     tolerance: float,
     lens: Lens | None = None,
     parameters: FloatArray | None = None,
-    behind_chi2: float = BEHIND_CHI2,
 ) -> Optimum:
     """Run Levenberg-Marquardt on the poses that are not fixed, and on all points.
 
@@ -118,11 +118,10 @@ def optimise(
     - `tolerance`: relative decrease of the cost below which to stop.
     - `lens`: one more variable, instead of ``problem.K``.
     - `parameters` (M,): of the lens, to begin with.
-    - `behind_chi2`: what a view of a point behind its camera counts as; with 0 a step may put a point there.
 
     Raises `SolverError` if no damping makes the system definite, or a residual is not finite.
     """
-    system = System(problem, loss, lens, behind_chi2)
+    system = System(problem, loss, lens)
     state = State(problem.T_submap_kf, problem.xyz_mu, np.zeros(0) if parameters is None else parameters)
     before = cost = system.cost(state)
     damping, n_definite = FIRST_DAMPING, 0
@@ -147,10 +146,8 @@ def optimise(
 class System:
     """The normal equations of a problem."""
 
-    def __init__(
-        self, problem: BundleProblem, loss: Loss, lens: Lens | None = None, behind_chi2: float = BEHIND_CHI2
-    ) -> None:
-        self._problem, self._loss, self._lens, self._behind_chi2 = problem, loss, lens, behind_chi2
+    def __init__(self, problem: BundleProblem, loss: Loss, lens: Lens | None = None) -> None:
+        self._problem, self._loss, self._lens = problem, loss, lens
         self._fitted: tuple[State, list[_Fit]] | None = None
         self._rows = np.argsort(problem.point, kind="stable")
         n_views = np.bincount(problem.point, minlength=len(problem.xyz_mu))
@@ -201,7 +198,7 @@ class System:
         if self._lens is not None:
             uv_px = self._lens.project(xyz_cam[:, :2] / xyz_cam[:, 2:], state.lens)
         residuals = (uv_px - p.uv_px[rows]) / p.sigma_px[rows, None]
-        chi2 = np.where(front, np.einsum("ri,ri->r", residuals, residuals), self._behind_chi2)
+        chi2 = np.where(front, np.einsum("ri,ri->r", residuals, residuals), BEHIND_CHI2)
         weight, losses = self._loss(chi2)
         return xyz_cam, residuals, np.where(front, weight, 0.0), losses
 

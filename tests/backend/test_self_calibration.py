@@ -165,6 +165,17 @@ class TestEstimate:
         assert estimate.cost_before < 1.5 * estimate.cost_after
         assert capfd.readouterr().out == ""
 
+    def test_no_camera_turns_away_from_all_that_it_has_seen(self) -> None:
+        """Three begin turned by 75 degrees. A view behind a camera must not cost less than any in front of it."""
+        camera = wrong_camera()
+        submap = make_submap(camera, turning=True)
+        problem = make_problem(submap, choose_window(submap, 60), camera, 15000)
+        T = problem.T_submap_kf.copy()
+        T[10:13, :3, :3] @= so3.exp(np.array([0.0, np.radians(75.0), 0.0]))
+        estimate = estimate_correction(replace(problem, T_submap_kf=T), WIDTH, LensCorrection(), CONFIG)
+        assert estimate
+        assert abs(estimate.correction.log_focal + np.log(1.03)) < 0.004
+
     def test_distortion_is_found(self) -> None:
         submap = make_submap(TRUE, turning=True)
         problem = make_problem(submap, choose_window(submap, 60), TRUE, 15000)
