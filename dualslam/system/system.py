@@ -242,11 +242,8 @@ class System:
         self.desk.begin_frame(source.index, state.pace.in_real_time)
         self._graphs.collect(frame)
         self._places.collect(frame)
-        if self._calibrations.collect(state.live, frame):
-            if state.live is None:
-                self._starting.begin_again()
-            elif state.lost:
-                self._begin_anew()
+        if state.live is not None and self._calibrations.collect(state.live, frame) and state.lost:
+            self._begin_anew()
         self._recoveries.in_real_time = state.pace.in_real_time
         self._recoveries.collect(state.live, frame)
         if state.pace.in_real_time:

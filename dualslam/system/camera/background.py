@@ -89,9 +89,8 @@ class Calibrations:
             self._desk.submit(JobKind.CALIBRATION, job, of=live.submap.id)
         self.collect(live, now)
 
-    def collect(self, live: VisualOdometry | None, now: FrameStamp, wait: bool = False) -> bool:
-        """Take in the answers; `live` continues in its submap as it is after that. While none is live, the last one
-        that was lost changes.
+    def collect(self, live: VisualOdometry, now: FrameStamp, wait: bool = False) -> bool:
+        """Take in the answers; `live` continues in its submap as it is after that. Those of a lost map are withdrawn.
 
         Returns whether the frames to come have another camera. `wait`: for a limited time, for what is open.
         """
@@ -102,7 +101,7 @@ class Calibrations:
         return self._calibration.camera is not before
 
     def _take(
-        self, job: CalibrationJob, result: CalibrationAnswer | Failure, live: VisualOdometry | None, now: FrameStamp
+        self, job: CalibrationJob, result: CalibrationAnswer | Failure, live: VisualOdometry, now: FrameStamp
     ) -> None:
         """Let submap, graph, buffer and lost submaps change to the camera that was found, all of them or none."""
         failure = result if isinstance(result, Failure) else self._take_answer(job, result, live, now)
@@ -115,14 +114,13 @@ class Calibrations:
         self._record.event(EventKind.CALIBRATED, now, job.submap.id, lost=failure, **result.numbers)
 
     def _take_answer(
-        self, job: CalibrationJob, answer: CalibrationAnswer, live: VisualOdometry | None, now: FrameStamp
+        self, job: CalibrationJob, answer: CalibrationAnswer, live: VisualOdometry, now: FrameStamp
     ) -> list[int] | Failure:
         """Return the lost submaps that have changed, too."""
-        submaps = self._record.atlas.submaps
-        if job.submap.id != (max(submaps) if live is None else live.submap.id):
+        submap, graph = live.submap, self._new_graph()
+        if job.submap.id != submap.id:
             # What came after was made with the camera of before, and would be left apart from all that changes.
             return Failure(FailureReason.DISABLED, "the submap that was asked is live no more", answer.numbers)
-        submap, graph = submaps[job.submap.id], self._new_graph()
         try:
             merged = merge_calibrated(submap, job.submap, answer)
             merged.apply_estimate(*graph.rebuild(merged, near_optimum=True).values)
@@ -131,8 +129,7 @@ class Calibrations:
         self._calibration.take(answer)
         before = submap.copy()
         submap.take_over(merged)
-        if live is not None:
-            live.adopt(graph, before)
+        live.adopt(graph, before)
         self._buffer.map_later(self._calibration.rectified, "camera")
         self._connections.follow(before, submap, now)
         changed = [m for m in self._recoveries.waiting if self._change_lost(m, job, answer, now)]

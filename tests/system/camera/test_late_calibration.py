@@ -147,10 +147,9 @@ def test_a_next_start_has_the_pixels_of_a_camera_that_was_found_while_the_map_wa
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("polls", [0, 12])
-def test_a_map_is_asked_as_it_is_lost_and_the_next_begins_with_its_camera(polls: int) -> None:
-    """It is not its time to be asked. An answer after twelve frames finds the map archived, and none yet live."""
-    system, world = late_system(polls, recovery=True)
+def test_a_map_is_asked_as_it_is_lost_and_the_next_begins_with_its_camera() -> None:
+    """It is not its time to be asked."""
+    system, world = late_system(0, recovery=True)
     calibration, blind = system._state.parts.calibration, range(40, 55)
     calibration.is_due = lambda *_: False  # type: ignore[method-assign]
 
@@ -163,9 +162,8 @@ def test_a_map_is_asked_as_it_is_lost_and_the_next_begins_with_its_camera(polls:
         system.step(Frame(i, i / 30, None))
         if i > blind[-1] and system.live is not None:
             break
-    (found,), (failed,) = (system.events.of_kind(kind) for kind in (EventKind.CALIBRATED, EventKind.FAILED))
-    assert found.frame == blind[0] + polls
-    assert (found.frame > failed.frame) is (polls > 0)
+    (found,) = system.events.of_kind(EventKind.CALIBRATED)
+    assert found.frame == blind[0]
     camera = calibration.camera
     assert abs(np.log(camera.K[0, 0] / TRUE.fx)) < 0.25 * np.log(WRONG)
     for submap in system.atlas.submaps.values():
