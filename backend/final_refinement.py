@@ -11,6 +11,7 @@ agrees: that is an optimum, too (docs/notes/2026-11-28-few-false-near-points-hol
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import replace
 
 import numpy as np
@@ -30,10 +31,10 @@ LEAST_NOISE = 0.05
 """Standard deviation that residuals have at least, in the pixels' sigmas: those of made-up pixels vanish."""
 ITERATIONS = 3
 WIDER = (16.0, 4.0)
-"""Times as wide as the loss is at first where landmarks were made one: their places differ by tens of pixels."""
+"""Times as wide as the loss is where landmarks were made one: their places differ by tens of pixels."""
 
 
-def refine_submap(submap: Submap, robust_k: float, frames: FrameRows | None = None, tied: bool = False) -> float:
+def refine_submap(submap: Submap, robust_k: float, frames: FrameRows | None = None) -> float:
     """Refine all keyframes and landmarks of a submap, in place.
 
     Its first keyframe stays where it is, and the mean square distance of the others from it stays what it is.
@@ -41,19 +42,34 @@ def refine_submap(submap: Submap, robust_k: float, frames: FrameRows | None = No
     - `robust_k`: Huber threshold in sigmas, for landmarks whose depth is too uncertain to take part: they follow the
       poses.
     - `frames`: what frames that are no keyframes have seen: more views of the same landmarks.
-    - `tied`: landmarks were made one that the map had in different places.
 
     Returns float: shape of the loss, in the pixels' sigmas; `FORGETS_AT` where there is one keyframe.
 
     Raises `SolverError` if the solver fails. The submap is as it was.
     """
-    first, *others = submap.keyframes
-    if not others:
+    if len(submap.keyframes) < 2:
         return FORGETS_AT
-    shape, centre = FORGETS_AT * _residual_sigma(submap), submap.T_submap_kf[first][:3, 3]
-    refined, seen = submap.copy(), submap.landmarks_of_keyframes([first, *others])
-    passes = [(wider * shape, seen) for wider in WIDER if tied]
-    for width, landmarks in (*passes, (shape, _best_seen(submap)), (shape, seen)):
+    shape = FORGETS_AT * _residual_sigma(submap)
+    _refine(submap, robust_k, ((shape, _best_seen(submap)), (shape, _seen(submap))), frames)
+    return shape
+
+
+def settle_ties(submap: Submap, robust_k: float) -> None:
+    """Bend a submap in which landmarks were made one that it had in different places, in place, for `refine_submap`.
+
+    Keyframes and the best seen landmarks suffice: the rest follows. Parameters and errors are as there.
+    """
+    shape, best = FORGETS_AT * _residual_sigma(submap), _best_seen(submap)
+    _refine(submap, robust_k, ((wider * shape, best) for wider in WIDER), None)
+
+
+def _refine(
+    submap: Submap, robust_k: float, passes: Iterable[tuple[float, IntArray]], frames: FrameRows | None
+) -> None:
+    """Refine a submap in passes, each with a shape of the loss and the landmarks that take part; the others follow."""
+    first, *others = submap.keyframes
+    refined, seen, centre = submap.copy(), _seen(submap), submap.T_submap_kf[first][:3, 3]
+    for width, landmarks in passes:
         bundle = bundle_adjust(refined, others, [first], width, ITERATIONS, True, frames, landmarks)
         refined.apply_estimate(*bundle.estimate)
         if frames is not None:
@@ -64,7 +80,10 @@ def refine_submap(submap: Submap, robust_k: float, frames: FrameRows | None = No
     unit = _extent(submap.keyframe_poses(others), centre) / _extent(T, centre)
     T[:, :3, 3] = centre + unit * (T[:, :3, 3] - centre)
     submap.apply_estimate(np.array(others), T, seen, centre + unit * (refined.landmarks["xyz_mu"][seen] - centre))
-    return shape
+
+
+def _seen(submap: Submap) -> IntArray:
+    return submap.landmarks_of_keyframes(list(submap.keyframes))
 
 
 def _best_seen(submap: Submap) -> IntArray:

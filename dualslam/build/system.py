@@ -11,7 +11,7 @@ import numpy as np
 
 from dualslam.atlas.stored_map import StoredMap
 from dualslam.atlas.tidying import tidy
-from dualslam.backend.final_refinement import refine_submap
+from dualslam.backend.final_refinement import refine_submap, settle_ties
 from dualslam.backend.registration_bundle import adjust_and_prune
 from dualslam.build.checks import check_config, check_given
 from dualslam.build.parts import atlas_solver, graph_maker, new_calibration, new_initialiser, place_parts, window_solver
@@ -166,6 +166,7 @@ def build_system(
             match_wide=frontend.match_wide,
             alike=partial(find_resembling, distance=frontend.distance, max_distance=frontend.max_distance_strict),
             atlas_solver=atlas_solver(config),
+            settle_ties=partial(settle_ties, robust_k=config.graph.robust_k),
             refine_at_end=partial(refine_submap, robust_k=config.graph.robust_k),
             patches=PatchAudit(live.camera),
             graphs=graphs,

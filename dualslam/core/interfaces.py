@@ -250,11 +250,8 @@ class FinalRefiner(Protocol):
     Raises `SolverError`, and leaves the submap as it was, where the solver fails.
     """
 
-    def __call__(self, submap: Submap, *, frames: FrameRows, tied: bool) -> float:
-        """Refine by keyframes and frames, and return the shape of that loss, in the pixels' sigmas.
-
-        `tied`: landmarks were made one that the map had in different places.
-        """
+    def __call__(self, submap: Submap, *, frames: FrameRows) -> float:
+        """Refine by keyframes and frames, and return the shape of that loss, in the pixels' sigmas."""
         ...
 
 

@@ -136,10 +136,8 @@ class Endings:
             self._recoveries.collect(state.live, view)
         return True
 
-    def refine(self, tied: Set[int]) -> dict[int, float]:
+    def refine(self) -> dict[int, float]:
         """Refine this run's submaps in batch, at the end of the run, now that all they have seen is in them.
-
-        `tied`: submaps in which landmarks were made one.
 
         Returns for each the shape of the loss under which that was done, for `pose_frames_anew`.
         """
@@ -150,7 +148,7 @@ class Endings:
                 submap = record.atlas.submaps[m]
                 before, frames = submap.copy(), rows_of_frames(record, submap, len(submap.keyframes), min_inliers)
                 try:
-                    shapes[m] = self._state.parts.refine_at_end(submap, frames=frames, tied=m in tied)
+                    shapes[m] = self._state.parts.refine_at_end(submap, frames=frames)
                 except SolverError as error:
                     log.warning("submap %d stays as tracking has left it: %s", m, error)
                     continue

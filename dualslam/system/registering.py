@@ -6,6 +6,7 @@ import logging
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -38,7 +39,6 @@ class Registering:
         self._state, self._connections = state, connections
         self._kept: dict[int, View] = {}
         self._nbytes = 0
-        self.tied: set[int] = set()  # submaps whose keyframes share more landmarks now
 
     def note(self, view: View) -> None:
         """Keep a frame that has no pose, without its image; as many of them as the frame buffer may hold."""
@@ -58,21 +58,26 @@ class Registering:
     # --- steps
 
     def _tie(self) -> None:
-        """Let keyframes of a submap that show the same share its landmarks: each map is refined by these ties."""
-        record = self._state.record
+        """Let keyframes of a submap that show the same share its landmarks, and bend the submap accordingly."""
+        record, parts = self._state.record, self._state.parts
         with record.timer.measure("ties"):
             for m, submap in record.atlas.submaps.items():
-                if n := self._tie_within(submap):
-                    self.tied.add(m)
-                    log.info("submap %d: %d pairs of features show one landmark", m, n)
+                grown = submap.copy()
+                if not (n := parts.new_registrar(grown).tie(partial(self._find_alike, grown))):
+                    continue
+                try:
+                    parts.settle_ties(grown)
+                except SolverError as error:
+                    log.warning("submap %d is not tied: %s", m, error)
+                    continue
+                before = submap.copy()
+                submap.take_over(grown)
+                self._connections.carry(before, submap)
+                log.info("submap %d: %d pairs of features show one landmark", m, n)
 
-    def _tie_within(self, submap: Submap) -> int:
-        images, parts = {k: keyframe.features for k, keyframe in submap.keyframes.items()}, self._state.parts
-
-        def find_alike(ids: Collection[int]) -> dict[int, list[int]]:
-            return parts.alike(images, ids, REACH + 1)
-
-        return parts.new_registrar(submap).tie(find_alike)
+    def _find_alike(self, submap: Submap, ids: Collection[int]) -> dict[int, list[int]]:
+        """Return which of some keyframes resemble each other."""
+        return self._state.parts.alike({k: submap.keyframes[k].features for k in ids}, ids, REACH + 1)
 
     def _register_outside(self, now: FrameStamp) -> None:
         atlas, record = self._state.record.atlas, self._state.record

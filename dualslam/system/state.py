@@ -17,6 +17,7 @@ from dualslam.core.interfaces import (
     Scene,
     Seeker,
     Shutter,
+    SubmapAdjuster,
     SubmapGraph,
     VisualOdometry,
 )
@@ -67,7 +68,8 @@ class Components:
     `keep`: what stays of a frame that came too late to be tracked. `new_relocaliser`: a front end that finds its submap
     again wherever it is seen, and tracks from there. `walk_watch`: hears of reverse tracking that is under way. `desk`:
     does the background work. `graphs`: carries changes to submaps' graphs in another process and back, if they are
-    solved there. `refine_at_end`: has the last word on each submap.
+    solved there. `settle_ties`: bends a submap whose keyframes have come to share landmarks. `refine_at_end`: has the
+    last word on each submap.
     `patches`: compares frames with the images of older keyframes. `open_graph`: makes a graph of a submap in this
     process, solved. `open_features`: starts one more process, and returns a function that has the features of a frame
     found there. `new_registrar`, `adjust`, `alike`: for `recovery/registration.py`. `match_wide`: as of `Frontend`.
@@ -86,6 +88,7 @@ class Components:
     scene: Scene
     walk_watch: WalkWatch
     atlas_solver: AtlasSolver
+    settle_ties: SubmapAdjuster
     refine_at_end: FinalRefiner
     patches: PatchCheck
     places: PlaceParts

@@ -329,7 +329,7 @@ class System:
             link_overlaps(state.record, self._connections, state.config, own, last)
             if self._registers:
                 self._registering.finish(last)
-        shapes = {} if interrupted or state.localises else self._endings.refine(self._registering.tied)
+        shapes = {} if interrupted or state.localises else self._endings.refine()
         if last is not None:
             self._connections.settle(last)
             self._endings.pose_frames_anew(shapes)

@@ -7,7 +7,7 @@ from collections.abc import Collection
 import numpy as np
 import pytest
 
-from dualslam.backend.final_refinement import refine_submap
+from dualslam.backend.final_refinement import refine_submap, settle_ties
 from dualslam.core.config.settings import Config
 from dualslam.core.geometry import se3, so3
 from dualslam.core.types import FloatArray
@@ -62,7 +62,8 @@ def test_a_part_that_lies_askew_comes_to_lie_right(world: PointWorld) -> None:
     before = errors(submap, world)
     registrar = Registrar(OrbFrontend(), config, submap, CAMERA)
     assert registrar.tie(all_alike) > 50
-    refine_submap(submap, config.graph.robust_k, tied=True)
+    settle_ties(submap, config.graph.robust_k)
+    refine_submap(submap, config.graph.robust_k)
     assert before.max() > 3 * POSITION_M
     assert errors(submap, world).max() < POSITION_M
 

@@ -74,7 +74,7 @@ def ended(
     if forget:
         system._state.record.observations.clear()
 
-    def refine_at_end(submap: Submap, *, frames: FrameRows, tied: bool) -> float:
+    def refine_at_end(submap: Submap, *, frames: FrameRows) -> float:
         assert len(frames.T_submap_cam) == (0 if forget else len(submap.keyframes))
         refine(submap)
         return 1.0
