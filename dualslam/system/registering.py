@@ -28,8 +28,8 @@ from dualslam.system.state import State
 
 log = logging.getLogger(__name__)
 
-REPEATS = (FailureReason.LOOK_ALIKE, FailureReason.LEAP, FailureReason.AMBIGUOUS_MODEL)
-"""Refusals that a scene which repeats itself causes."""
+LOOKS_ALIKE = (FailureReason.LOOK_ALIKE, FailureReason.AMBIGUOUS_MODEL)
+"""Refusals of a pose or a join because a second one explains as much."""
 
 
 class Registering:
@@ -51,7 +51,7 @@ class Registering:
 
     def finish(self, now: FrameStamp) -> None:
         """Register frames in the submaps of the main map, the one with most frames first; tie what shows the same."""
-        if self._state.record.poses and not self._has_repeated():
+        if self._state.record.poses:
             self._register_outside(now)
             self._tie()
 
@@ -61,9 +61,10 @@ class Registering:
         """Let keyframes of a submap that show the same share its landmarks, and bend the submap accordingly."""
         record, parts = self._state.record, self._state.parts
         with record.timer.measure("ties"):
+            copies = self._showing_copies()
             for m, submap in record.atlas.submaps.items():
                 grown = submap.copy()
-                if not (n := parts.new_registrar(grown).tie(partial(self._find_alike, grown))):
+                if m in copies or not (n := parts.new_registrar(grown).tie(partial(self._find_alike, grown))):
                     continue
                 try:
                     parts.settle_ties(grown)
@@ -74,6 +75,13 @@ class Registering:
                 submap.take_over(grown)
                 self._connections.carry(before, submap)
                 log.info("submap %d: %d pairs of features show one landmark", m, n)
+
+    def _showing_copies(self) -> set[int]:
+        """Return the submaps in which things look alike: a second pose or place explained as much as the first."""
+        events = self._state.record.events.of_kind(EventKind.FAILED, EventKind.LINK_REFUSED, EventKind.LOOP_REFUSED)
+        refused = [event for event in events if event.data.get("reason") in LOOKS_ALIKE]
+        named = [(event.submap, event.data.get("old_submap"), event.data.get("other_submap")) for event in refused]
+        return {m for submaps in named for m in submaps if m is not None}
 
     def _find_alike(self, submap: Submap, ids: Collection[int]) -> dict[int, list[int]]:
         """Return which of some keyframes resemble each other."""
@@ -95,14 +103,6 @@ class Registering:
             for m in [largest] if whole else [largest, *rest]:
                 self._register(atlas.submaps[m], views, alike, now)
                 views = {i: view for i, view in views.items() if i not in atlas.submaps[m].keyframes}
-
-    def _has_repeated(self) -> bool:
-        """Whether a pose or a join was refused in this run because the scene repeats itself, or by the camera's motion.
-
-        Single frames tell copies of a thing apart no better than whole maps do.
-        """
-        refused = self._state.record.events.of_kind(EventKind.FAILED, EventKind.LINK_REFUSED, EventKind.LOOP_REFUSED)
-        return any(event.data.get("reason") in REPEATS for event in refused)
 
     def _shown_under_a_better_camera(self) -> Counter[int]:
         """Return of how many frames of lost maps each submap shows keyframes, where it found the camera for these.
