@@ -110,6 +110,13 @@ class FrameBuffer:
         """Let the buffer be a queue again."""
         self._frozen = False
 
+    def clear(self) -> None:
+        """Let go of all views."""
+        self._views.clear()
+        self._late.clear()
+        self._stale.clear()
+        self.nbytes = 0
+
     def change_all(self, change: Callable[[Iterable[View]], Iterable[View]]) -> None:
         """Put what `change` makes of the views, oldest first, into their places."""
         self.settle()

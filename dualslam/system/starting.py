@@ -245,6 +245,7 @@ class Starting:
         state = self._state
         state.live = odometry
         self._n_without_map = 0
+        self._collect([])  # lets go of the views before the start
         state.begin_health()
         self._recoveries.start(odometry.submap, view)
         self._recoveries.collect(odometry, view)

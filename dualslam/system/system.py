@@ -329,6 +329,7 @@ class System:
             link_overlaps(state.record, self._connections, state.config, own, last)
             if self._registers:
                 self._registering.finish(last)
+        self.buffer.clear()  # nothing walks through it any more, and refinement needs the memory
         shapes = {} if interrupted or state.localises else self._endings.refine()
         if last is not None:
             self._connections.settle(last)

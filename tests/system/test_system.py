@@ -84,6 +84,11 @@ def ended(
     return system
 
 
+def test_a_run_that_is_over_holds_no_frames(plain: System) -> None:
+    assert plain.buffer.peak_bytes > 0
+    assert (len(plain.buffer), plain.buffer.nbytes) == (0, 0)
+
+
 @pytest.mark.parametrize("interrupted", [False, True])
 def test_each_map_is_refined_once_at_the_end_unless_someone_waits(short: PointWorld, interrupted: bool) -> None:
     refined: list[int] = []
