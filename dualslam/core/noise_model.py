@@ -13,6 +13,8 @@ PROOF_VIEWS = 3
 """Views that prove a point: two show it on the epipolar line of each other, where anything may be."""
 MIN_CONSENSUS = 12
 """Matches below which a RANSAC consensus of a 3-point solver is no evidence."""
+START_POINTS = 50
+"""Points of two views that a map starts from, at least, as they are left after the first bundle adjustment."""
 MIN_DEPTH_MU = 1e-3
 """Points nearer to the camera's plane are taken as behind it, and shorter baselines as none. A submap's median depth is
 1 at first."""

@@ -125,7 +125,7 @@ def _blank(rows: Sequence[FrameRow], blank: list[int]) -> list[Reason]:
         return []
     first, last = _longest_run(rows, blank)
     text = (
-        f"{len(blank)} frames have no pose: they show too little, or nothing that the next frame shows, too. "
+        f"{len(blank)} frames have no pose: they show too little, or nothing that leads to a frame with a pose. "
         f"The longest stretch is {first} to {last}. Poses beside them do not suffer."
     )
     return [Reason(ReasonCode.UNPOSED, Level.GOOD, text, first, last)]

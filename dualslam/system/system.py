@@ -16,7 +16,8 @@ from dualslam.core.config.settings import Config
 from dualslam.core.events import EventKind
 from dualslam.core.interfaces import SubmapGraph, VisualOdometry
 from dualslam.core.jobs import JobKind
-from dualslam.core.types import BoolArray, Failure, FailureReason, Frame, FrameStatus, Start, Track, View
+from dualslam.core.noise_model import START_POINTS
+from dualslam.core.types import BoolArray, Failure, FailureReason, Features, Frame, FrameStatus, Start, Track, View
 from dualslam.core.walk_news import WalkNews
 from dualslam.map.frame_numbers import FrameNumbers
 from dualslam.map.frame_records import FrameResult, FrameRow
@@ -63,7 +64,7 @@ class System:
     pace : Pace
         Lag reported by the real-time feeder; unused otherwise.
     blank : set of int
-        Frames without a pose that share too little with either neighbour to be posed by anything.
+        Frames without a pose that nothing could pose: `_note_blank`.
     audit : PhotometricAudit
         How well the images agree with the map.
     numbers : FrameNumbers
@@ -80,6 +81,7 @@ class System:
         self.saved, self.numbers = saved, FrameNumbers(0 if saved is None else saved.next_id)
         self.blank: set[int] = set()
         self._before: View | None = None  # the frame before, of those that were read
+        self._apart = set[int]()  # it and the lost frames before it from which nothing leads to a pose
         self._world = saved.main[0] if saved is not None and saved.main else None
         self._worlds = Worlds(record.atlas, self._world)
         self._earlier = earlier = frozenset(record.atlas.submaps)
@@ -469,14 +471,26 @@ class System:
     # --- records
 
     def _note_blank(self, view: View, is_lost: bool) -> None:
-        """Note a lost frame that shares too little with the frames before and after it to be posed by anything."""
+        """Note lost frames that share too little with what has a pose, and with each other, to be posed by anything.
+
+        Frames that are blurred alike match each other. Tracking may reach them along neighbours that share enough, from
+        a frame with a pose or from two that could start a map.
+        """
         before, self._before = self._before, view
-        if is_lost:
+        n = 0 if before is None or not (is_lost or self._apart) else self._n_shared(before.features, view.features)
+        enough = self._state.config.tracking.min_inliers
+        if n >= enough and not (is_lost and self._apart and n < START_POINTS):
+            self.blank -= self._apart
+            self._apart = set()
+        elif is_lost:
+            self._apart = {view.index} | (self._apart if n >= enough else set())
             self.blank.add(view.index)
-        if before is not None and self.blank & {before.index, view.index}:
-            enough, a, b = self._state.config.tracking.min_inliers, before.features, view.features
-            if min(len(a), len(b)) >= enough and len(self._state.parts.match_wide(a, b)) >= enough:
-                self.blank -= {before.index, view.index}
+        else:
+            self._apart = set()
+
+    def _n_shared(self, a: Features, b: Features) -> int:
+        enough = self._state.config.tracking.min_inliers
+        return len(self._state.parts.match_wide(a, b)) if min(len(a), len(b)) >= enough else 0
 
     def _result(self, frame: Frame, outcome: Track | Failure, started: float) -> FrameResult:
         row = self.rows[frame.index]

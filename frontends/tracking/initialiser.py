@@ -21,17 +21,17 @@ from dualslam.core.decisions import Gate
 from dualslam.core.geometry import se3
 from dualslam.core.geometry.triangulation import triangulate_two_view
 from dualslam.core.interfaces import START_REACH, Frontend
-from dualslam.core.noise_model import GATE_SIGMAS, PROOF_VIEWS
+from dualslam.core.noise_model import GATE_SIGMAS, PROOF_VIEWS, START_POINTS
 from dualslam.core.types import Failure, FailureReason, Features, FloatArray, Matches, Start, View
 from dualslam.frontends.features.motion_statistics import match_by_motion, nearest_search
 from dualslam.frontends.tracking.direction import direction_angle_deg, direction_sigma_deg
-from dualslam.frontends.tracking.start_proof import MIN_POINTS, StartProof, ViewPair
+from dualslam.frontends.tracking.start_proof import StartProof, ViewPair
 from dualslam.frontends.tracking.two_view_hypotheses import RelativePoses
 
-MIN_MATCHES = round(1.2 * MIN_POINTS)
+MIN_MATCHES = round(1.2 * START_POINTS)
 """Matches between the two views below which no model is tried: a sixth of them may be wrong."""
 MIN_PARALLAX_DEG = 1.0
-"""Angle under which the two cameras must see half as many points as `MIN_POINTS`, after the rotation is taken out.
+"""Angle under which the two cameras must see half as many points as `START_POINTS`, after the rotation is taken out.
 However many more are far away: on a road most are, and the near ones fix the motion."""
 MAX_DIRECTION_SIGMA_DEG = 1.5
 """Largest standard deviation (from the bundle adjustment's Hessian) of the direction of translation: by the pixels'
@@ -160,9 +160,9 @@ class Initialiser:
         uv_a, uv_b = a.features.uv_rect_px[fa], b.features.uv_rect_px[fb]
         sigma = np.maximum(a.features.sigma_px[fa], b.features.sigma_px[fb])
         poses = RelativePoses(uv_a, uv_b, sigma, self._K, self._size_px, self._seed)
-        if poses.n_moved < int(NEAR * MIN_POINTS):
+        if poses.n_moved < int(NEAR * START_POINTS):
             detail = f"a turn explains all but {poses.n_moved} of {len(matches)} matches"
-            gate = Gate("matches that no turn explains", poses.n_moved, ">=", int(NEAR * MIN_POINTS))
+            gate = Gate("matches that no turn explains", poses.n_moved, ">=", int(NEAR * START_POINTS))
             return Failure(FailureReason.LOW_PARALLAX, detail, gates=(gate,))
         pairs = [self._evaluate(a, b, matches, T_b_a) for T_b_a in poses.of_turns()]
         if (hopeless := self._hopeless(pairs, len(matches))) is not None:
@@ -176,8 +176,8 @@ class Initialiser:
         best = max(contenders, key=lambda p: int(p.good.sum()))
         n_good = int(best.good.sum())
         numbers = {"n_matches": float(len(matches)), "n_points": float(n_good), "parallax_deg": best.parallax_deg}
-        enough = Gate("points", n_good, ">=", MIN_POINTS)
-        near = Gate("near points", best.n_near, ">=", NEAR * MIN_POINTS)
+        enough = Gate("points", n_good, ">=", START_POINTS)
+        near = Gate("near points", best.n_near, ">=", NEAR * START_POINTS)
         if not enough.passed:
             detail = f"{n_good} points of {len(matches)} matches"
             return Failure(FailureReason.TOO_FEW_INLIERS, detail, numbers, gates=(enough,))
@@ -203,7 +203,7 @@ class Initialiser:
             return Failure(FailureReason.AMBIGUOUS_MODEL, "two poses explain the views alike")
         loosest_deg = DIRECTION_MARGIN * MAX_DIRECTION_SIGMA_DEG
         for pair in sure:
-            has_points = pair.good.sum() >= MIN_POINTS
+            has_points = pair.good.sum() >= START_POINTS
             if has_points and (direction := self._direction_sigma_deg(pair)) > loosest_deg:
                 return _direction_unknown(direction, loosest_deg, {})
         return None
@@ -244,10 +244,10 @@ class Initialiser:
             seeing = np.array([first, *between, last])
         among = np.linspace(0, len(seeing) - 1, PROOF_VIEWS + 2)[1:-1]
         positions = sorted({int(seeing[round(place)]) for place in among} - {first, last})
-        return [self._views[p] for p in positions if len(self._views[p].features) >= MIN_POINTS]
+        return [self._views[p] for p in positions if len(self._views[p].features) >= START_POINTS]
 
     def _sees(self, view: View, points: Features) -> bool:
-        return len(self._frontend.match_wide(points, view.features)) >= MIN_POINTS // 2
+        return len(self._frontend.match_wide(points, view.features)) >= START_POINTS // 2
 
 
 def _direction_unknown(direction_sigma_deg: float, most_deg: float, numbers: dict[str, float]) -> Failure:
@@ -263,7 +263,7 @@ def _few_are_chance(start: Start) -> Start | Failure:
     know their direction to 1.5 degrees all six with 25 to 44 such points were 7 to 88 degrees off. None of 22 with 53
     and more was off by more than 8 (`tum_fr1_rpy`).
     """
-    proven = Gate("points that three views prove", start.numbers["n_proven"], ">=", MIN_POINTS)
+    proven = Gate("points that three views prove", start.numbers["n_proven"], ">=", START_POINTS)
     if proven.passed:
         return start
     detail = f"three views prove {start.numbers['n_proven']:.0f} points of two views far apart"

@@ -13,7 +13,7 @@ from dualslam.core.errors import SolverError
 from dualslam.core.geometry import se3
 from dualslam.core.geometry.projection import refine_pose
 from dualslam.core.interfaces import Frontend
-from dualslam.core.noise_model import MIN_CONSENSUS, PROOF_VIEWS
+from dualslam.core.noise_model import MIN_CONSENSUS, PROOF_VIEWS, START_POINTS
 from dualslam.core.support import MAX_CHI2
 from dualslam.core.types import BoolArray, Failure, FailureReason, FloatArray, IntArray, Matches, Start, View
 from dualslam.frontends.tracking.direction import direction_sigma_deg
@@ -21,8 +21,6 @@ from dualslam.frontends.tracking.near_points import nearer_than_proven, stands_b
 from dualslam.frontends.tracking.resection import MIN_SAMPLE, resect
 from dualslam.frontends.tracking.two_view_hypotheses import MIN_NOISE2
 
-MIN_POINTS = 50
-"""Triangulated points that must survive the first bundle adjustment."""
 MIN_SUPPORT = 0.6
 """Share of the points that the frames between the two views must confirm by their own pixels."""
 PROVEN = 1 / 3  # share of the points that are proven, at least: a start is made of these alone
@@ -105,7 +103,7 @@ class StartProof:
         it agreed with them.
         """
         matches = self._frontend.match_wide(first.features.take(feature), witness.features)
-        if len(matches) < MIN_POINTS // 2:
+        if len(matches) < START_POINTS // 2:
             return Failure(FailureReason.TOO_FEW_MATCHES, f"{len(matches)} of {len(xyz)} points found")
         point, seen = matches.index[:, 0], matches.index[:, 1]
         uv_px, sigma_px = witness.features.uv_rect_px[seen], witness.features.sigma_px[seen]
@@ -145,7 +143,7 @@ class StartProof:
         in_front = np.all(se3.act(se3.inverse(result.T_submap_kf), result.xyz_mu)[..., 2] > 0, axis=0)
         keep = _agreeing(problem, inlier) & in_front & result.adjusted
         numbers["n_points"] = float(keep.sum())
-        survivors = Gate("points after adjustment", int(keep.sum()), ">=", MIN_POINTS)
+        survivors = Gate("points after adjustment", int(keep.sum()), ">=", START_POINTS)
         share = Gate("share of points after adjustment", float(keep.mean()), ">=", MIN_SUPPORT)
         if not (survivors.passed and share.passed):
             detail = f"{keep.sum()} of {len(xyz)} points survive adjustment"
