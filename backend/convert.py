@@ -13,6 +13,7 @@ from __future__ import annotations
 import gtsam
 import numpy as np
 
+from dualslam.core.geometry import se3
 from dualslam.core.types import FloatArray, IntArray
 
 _POSE_PREFIX = ord("x") << 56
@@ -43,7 +44,7 @@ def keyframe_of(key: int) -> int:
 
 def to_pose3(T: FloatArray) -> gtsam.Pose3:
     """Make a `Pose3` of a (4, 4) rigid transform; a rotation a little off SO(3) is put back onto it."""
-    return gtsam.Pose3(gtsam.Rot3(_nearest_rotation(T[:3, :3])), T[:3, 3])
+    return gtsam.Pose3(gtsam.Rot3(_nearest_rotation(se3.rotation(T))), se3.translation(T))
 
 
 def from_pose3(T: gtsam.Pose3) -> FloatArray:
@@ -66,10 +67,7 @@ def to_similarity3(S: FloatArray) -> gtsam.Similarity3:
 def from_similarity3(S: gtsam.Similarity3) -> FloatArray:
     """Return our (4, 4) ``[[s R, t], [0, 1]]`` of a `Similarity3`."""
     s = S.scale()
-    matrix = np.eye(4)
-    matrix[:3, :3] = s * S.rotation().matrix()
-    matrix[:3, 3] = s * S.translation()
-    return matrix
+    return se3.from_parts(s * S.rotation().matrix(), s * S.translation())
 
 
 def to_cal3_s2(K: FloatArray) -> gtsam.Cal3_S2:
@@ -80,11 +78,7 @@ def to_cal3_s2(K: FloatArray) -> gtsam.Cal3_S2:
 def poses_of(values: gtsam.Values) -> FloatArray:
     """Return all `Pose3` of `values` as (K, 4, 4), in ascending order of their keys."""
     rows = np.asarray(gtsam.utilities.extractPose3(values), float).reshape(-1, 12)
-    poses = np.zeros((len(rows), 4, 4))
-    poses[:, :3, :3] = rows[:, :9].reshape(-1, 3, 3)
-    poses[:, :3, 3] = rows[:, 9:]
-    poses[:, 3, 3] = 1
-    return poses
+    return se3.from_parts(rows[:, :-3].reshape(-1, 3, 3), rows[:, -3:])
 
 
 def points_of(values: gtsam.Values) -> FloatArray:

@@ -86,7 +86,7 @@ def _covariance(
     # How a point moves with the poses: dp = moves @ dc.
     moves = np.asarray(-np.linalg.inv(H_points) @ flat, np.float64)
     system = information.reshape(6 * n, 6 * n) + flat.reshape(-1, 6 * n).T @ moves.reshape(-1, 6 * n)
-    R = submap.keyframe_poses(window)[:, :3, :3]
+    R = se3.rotation(submap.keyframe_poses(window))
     units = [_unit(c, kf, point, x_cam, R[c], moves, n) for c in (a, b)]
     system += np.outer(units[0], units[0]) / GAUGE_SIGMA**2
     free = np.delete(np.arange(6 * n), np.arange(6 * a, 6 * a + 6))

@@ -21,6 +21,7 @@ from dualslam.backend.noise import residual_variance
 from dualslam.backend.observability import compute_residuals
 from dualslam.backend.point_refinement import refit_points
 from dualslam.core.bundle import FrameRows
+from dualslam.core.geometry import se3
 from dualslam.core.types import FloatArray, IntArray
 from dualslam.map.submap import Submap
 
@@ -68,7 +69,7 @@ def _refine(
 ) -> None:
     """Refine a submap in passes, each with a shape of the loss and the landmarks that take part; the others follow."""
     first, *others = submap.keyframes
-    refined, seen, centre = submap.copy(), _seen(submap), submap.T_submap_kf[first][:3, 3]
+    refined, seen, centre = submap.copy(), _seen(submap), se3.translation(submap.T_submap_kf[first])
     for width, landmarks in passes:
         bundle = bundle_adjust(refined, others, [first], width, ITERATIONS, True, frames, landmarks)
         refined.apply_estimate(*bundle.estimate)
@@ -78,7 +79,7 @@ def _refine(
         refined.landmarks["xyz_mu"][beside] = refit_points(refined, robust_k, beside)
     T = refined.keyframe_poses(others)
     unit = _extent(submap.keyframe_poses(others), centre) / _extent(T, centre)
-    T[:, :3, 3] = centre + unit * (T[:, :3, 3] - centre)
+    T[:, :3, 3] = centre + unit * (se3.translation(T) - centre)
     submap.apply_estimate(np.array(others), T, seen, centre + unit * (refined.landmarks["xyz_mu"][seen] - centre))
 
 
@@ -102,7 +103,7 @@ def _best_seen(submap: Submap) -> IntArray:
 
 def _extent(T_submap_kf: FloatArray, centre: FloatArray) -> float:
     """Return the keyframes' distances from a place, root mean square."""
-    return float(np.sqrt(((T_submap_kf[:, :3, 3] - centre) ** 2).sum(axis=1).mean()))
+    return float(np.sqrt(((se3.translation(T_submap_kf) - centre) ** 2).sum(axis=1).mean()))
 
 
 def _residual_sigma(submap: Submap) -> float:

@@ -12,6 +12,7 @@ import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
+from dualslam.core.geometry import se3
 from dualslam.core.noise_model import MIN_DEPTH_MU
 from dualslam.core.types import BoolArray, FloatArray, IntArray
 
@@ -104,7 +105,7 @@ def compute_depth_sigmas(
     Returns (n_points,) float64: largest standard deviation of the point relative to its least depth; infinite with
     fewer than two views.
     """
-    J = projection_jacobian(K, T_submap_kf.take(pose, axis=0)[:, :3, :3], xyz_cam, sigma_px)
+    J = projection_jacobian(K, se3.rotation(T_submap_kf.take(pose, axis=0)), xyz_cam, sigma_px)
     information = sum_products(J, J, point, n_points)
     depth = np.full(n_points, np.inf)
     np.minimum.at(depth, point, xyz_cam[:, 2])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from dualslam.backend.observability import projection_jacobian, reproject, sum_products
+from dualslam.core.noise_model import TINY
 from dualslam.core.types import FloatArray, IntArray
 from dualslam.map.submap import Submap
 
@@ -29,7 +30,7 @@ def huber(chi2: FloatArray, k: float) -> tuple[FloatArray, FloatArray]:
     """Return weights and losses (as GTSAM: half the square within `k`) of squared whitened residuals."""
     r = np.sqrt(chi2)
     inside = r <= k
-    weight = np.where(inside, 1.0, k / np.maximum(r, 1e-12))
+    weight = np.where(inside, 1.0, k / np.maximum(r, TINY))
     return weight, np.where(inside, chi2 / 2, k * (r - k / 2))
 
 
@@ -74,7 +75,7 @@ def refine_points(
         weight[~front] = 0.0
         J = projection_jacobian(K, R, safe, sigma_px)
         H, b = normal_equations(J, weight, r, point, n)
-        H += (DAMPING * np.trace(H, axis1=1, axis2=2) + 1e-12)[:, None, None] * np.eye(3)
+        H += (DAMPING * np.trace(H, axis1=1, axis2=2) + TINY)[:, None, None] * np.eye(3)
         xyz = xyz - np.linalg.solve(H, b[:, :, None])[:, :, 0]
     return best
 

@@ -8,6 +8,7 @@ import numpy as np
 
 from dualslam.backend.local_ba import bundle_adjust
 from dualslam.core.chi_square import CHI2_99
+from dualslam.core.noise_model import TINY
 from dualslam.core.types import FloatArray, IntArray
 from dualslam.map.submap import Submap
 
@@ -52,7 +53,7 @@ def parallax_rad(submap: Submap, landmark_ids: IntArray) -> FloatArray:
     ids, pose = np.unique(submap.observations["kf"][rows], return_inverse=True)
     landmark = submap.observations["landmark"][rows]
     rays = submap.landmarks["xyz_mu"][landmark] - submap.keyframe_poses(ids)[pose, :3, 3]
-    rays /= np.maximum(np.linalg.norm(rays, axis=1), 1e-12)[:, None]
+    rays /= np.maximum(np.linalg.norm(rays, axis=1), TINY)[:, None]
     order = np.argsort(landmark, kind="stable")
     rays, point = rays[order], np.searchsorted(landmark_ids, landmark[order])
     begins = np.flatnonzero(np.diff(point, prepend=-1))

@@ -208,7 +208,7 @@ class System:
     def _linearise(self, chunk: tuple[int, int], state: State, fit: _Fit) -> _Linear:
         p, rows = self._problem, self._rows_of(chunk)
         xyz_cam, residuals, weight, _ = fit
-        R, sigma_px = state.T_submap_kf.take(p.kf[rows], axis=0)[:, :3, :3], p.sigma_px[rows]
+        R, sigma_px = se3.rotation(state.T_submap_kf.take(p.kf[rows], axis=0)), p.sigma_px[rows]
         if self._lens is None:
             J_point = projection_jacobian(p.K, R, xyz_cam, sigma_px).transpose(2, 0, 1)
             J_cam = J_point @ R

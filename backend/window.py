@@ -129,7 +129,7 @@ def adjust_window(window: BundleProblem, robust_k: float, iterations: int = ITER
     damping = FIRST_DAMPING
     for _ in range(iterations):
         safe = np.where(np.isfinite(state.chi2)[:, None], state.xyz_cam, [0.0, 0.0, 1.0])
-        R = state.T.take(window.kf, axis=0)[:, :3, :3]
+        R = se3.rotation(state.T.take(window.kf, axis=0))
         J = projection_jacobian(window.K, R, safe, window.sigma_px)
         V, g_point = normal_equations(J, state.weight, state.residuals, window.point, n_points)
         # By the pose: in the camera, a point moves by [p]x omega - v.

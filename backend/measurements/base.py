@@ -76,7 +76,7 @@ def noise(rng: Generator | None, sigma: float, n: int) -> FloatArray:
 
 def point_jacobian(T: FloatArray, p_cam: FloatArray) -> FloatArray:
     """Return the derivative (3, 6) of ``T @ p_cam`` by a right perturbation of a pose."""
-    R = T[:3, :3]
+    R = se3.rotation(T)
     return np.asarray(np.hstack((-R @ so3.hat(p_cam), R)))
 
 

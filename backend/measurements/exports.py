@@ -43,11 +43,11 @@ def export_graph(problem: MetricProblem, S_metric_node: FloatArray, terms: Seque
     for term in terms:
         if term.reading.kind == "position":
             at = term.T_node_cam[0]
-            arm = scale[term.nodes[0]] * at[:3, 3] + at[:3, :3] @ np.asarray(term.reading.lever_arm_m)
+            arm = scale[term.nodes[0]] * se3.translation(at) + se3.rotation(at) @ np.asarray(term.reading.lever_arm_m)
             noise = gtsam.noiseModel.Diagonal.Sigmas(np.asarray(term.reading.sigmas, float))
             graph.push_back(gtsam.GPSFactorArm(term.nodes[0], np.asarray(term.reading.xyz_m, float), arm, noise))
     return {G2O: "\n".join(lines) + "\n", GTSAM_GRAPH: graph.serialize(), GTSAM_VALUES: values.serialize()}
 
 
 def _words(T: FloatArray) -> str:
-    return " ".join(f"{x:.9g}" for x in (*T[:3, 3], *so3.quat_xyzw_from_matrix(T[:3, :3])))
+    return " ".join(f"{x:.9g}" for x in (*se3.translation(T), *so3.quat_xyzw_from_matrix(se3.rotation(T))))

@@ -26,9 +26,9 @@ from dualslam.backend.noise import gaussian
 from dualslam.backend.solver import GTSAM_ERRORS
 from dualslam.core.chi_square import CHI2_99, CHI2_999, MEDIAN_CHI2
 from dualslam.core.errors import InputError
-from dualslam.core.geometry import sim3, so3
+from dualslam.core.geometry import se3, sim3, so3
 from dualslam.core.metric_problem import MeasurementSource, MetricProblem, MetricSolution, pose_by_node
-from dualslam.core.noise_model import ROBUST_N
+from dualslam.core.noise_model import ROBUST_N, TINY
 from dualslam.core.types import FloatArray
 
 ODOMETRY = ("within", "rollover")
@@ -210,7 +210,7 @@ class JointGraph:
             late = []
             for term in terms:
                 r, J = self._evaluate(term, self.values)
-                late.append(float(J[-1][:, 0] @ r) / max(float(J[-1][:, 0] @ J[-1][:, 0]), 1e-9))
+                late.append(float(J[-1][:, 0] @ r) / max(float(J[-1][:, 0] @ J[-1][:, 0]), TINY))
             steps = [
                 abs(np.median(late[i - ROBUST_N : i]) - np.median(late[i : i + ROBUST_N]))
                 for i in range(ROBUST_N, len(late) - ROBUST_N + 1)
@@ -249,9 +249,9 @@ class JointGraph:
         ratio = self._ratios()
         if ratio.max() <= 1.0:
             return
-        mu = 1.0 / max(2.0 * float(ratio.max()) - 1.0, 1e-9)
+        mu = 1.0 / max(2.0 * float(ratio.max()) - 1.0, TINY)
         while mu < GNC_END:
-            between = np.sqrt(mu * (mu + 1.0) / np.maximum(ratio, 1e-12)) - mu
+            between = np.sqrt(mu * (mu + 1.0) / np.maximum(ratio, TINY)) - mu
             weights = np.where(ratio <= mu / (mu + 1), 1.0, np.where(ratio >= (mu + 1) / mu, 0.0, between))
             self._weigh(weights)
             self._optimise(coarsely=True)
@@ -308,10 +308,10 @@ class JointGraph:
                 S = convert.to_similarity3(e.S_first_second)
                 C = self._edge_covariance(i) / weight
                 graph.push_back(gtsam.BetweenFactorSimilarity3(e.first, e.second, S, gaussian(C)))
-        extent = float(np.ptp(self.problem.T_world_cam[:, :3, 3], axis=0).max())
+        extent = float(np.ptp(se3.translation(self.problem.T_world_cam), axis=0).max())
         for node in self._held:
             S = self.S_start @ self.problem.S_world_node[node]
-            unit = extent / max(float(sim3.scale(self.problem.S_world_node[node])), 1e-12)
+            unit = extent / max(float(sim3.scale(self.problem.S_world_node[node])), TINY)
             sigmas = GAUGE_SIGMAS * np.repeat([1.0, max(unit, 1e-6), 1.0], [3, 3, 1])
             noise = gtsam.noiseModel.Diagonal.Sigmas(sigmas)
             graph.push_back(gtsam.PriorFactorSimilarity3(node, convert.to_similarity3(S), noise))
@@ -376,9 +376,8 @@ class JointGraph:
             at = term.T_node_cam[i]
             if tau:
                 at = at @ _small_motion(tau * term.twist[i])
-            T[i] = np.eye(4)
-            T[i, :3, :3] = M[:3, :3] @ at[:3, :3]
-            T[i, :3, 3] = s * (M[:3, :3] @ at[:3, 3] + M[:3, 3])
+            R, t = se3.rotation(M), se3.translation(M)
+            T[i] = se3.from_parts(R @ se3.rotation(at), s * (R @ se3.translation(at) + t))
             J_node.append(pose_by_node(s, at))
             J_tau.append(term.twist[i] * np.repeat([1.0, s], 3))
         r, J = term.reading.residual(T, shared)
@@ -475,7 +474,4 @@ def _largest_sigma(C: FloatArray) -> float:
 def _small_motion(xi: FloatArray) -> FloatArray:
     """Return the pose of a short motion, to second order: `se3.exp` would be half of all the time."""
     W = so3.hat(xi[:3])
-    T = np.eye(4)
-    T[:3, :3] += W + 0.5 * W @ W
-    T[:3, 3] = xi[3:] + 0.5 * W @ xi[3:]
-    return T
+    return se3.from_parts(np.eye(len(W)) + W + 0.5 * W @ W, xi[3:] + 0.5 * W @ xi[3:])

@@ -11,6 +11,7 @@ from numpy.random import Generator
 
 from dualslam.backend.measurements.base import Gauge, Measurement, Mount, Residual, between, noise, point_jacobian
 from dualslam.core.geometry import se3, so3
+from dualslam.core.noise_model import TINY
 from dualslam.core.types import FloatArray
 
 Vector = tuple[float, float, float]
@@ -40,18 +41,18 @@ class Position(Measurement):
     def residual(self, T: FloatArray, shared: FloatArray) -> Residual:
         """Return predicted minus measured position, metres."""
         arm = np.asarray(self.lever_arm_m)
-        return T[0, :3, :3] @ arm + T[0, :3, 3] - np.asarray(self.xyz_m), point_jacobian(T[0], arm)
+        return se3.rotation(T[0]) @ arm + se3.translation(T[0]) - np.asarray(self.xyz_m), point_jacobian(T[0], arm)
 
     @classmethod
     def of_row(cls, row: Sequence[float], mount: Mount) -> Self:
         """Make a reading of a line."""
-        x, y, z = mount.T_cam_body[:3, 3].tolist()
+        x, y, z = se3.translation(mount.T_cam_body).tolist()
         return cls(row[0], (row[1], row[2], row[3]), (row[4], row[5], row[6]), (x, y, z))
 
     @classmethod
     def simulate(cls, times_s: Sequence[float], T: FloatArray, sigma: float, rng: Generator | None = None) -> Self:
         """Make the reading that a true pose gives."""
-        x, y, z = (T[0, :3, 3] + noise(rng, sigma, 3)).tolist()
+        x, y, z = (se3.translation(T[0]) + noise(rng, sigma, 3)).tolist()
         return cls(times_s[0], (x, y, z), sigma)
 
 
@@ -94,19 +95,19 @@ class Direction(Measurement):
 
     def residual(self, T: FloatArray, shared: FloatArray) -> Residual:
         """Return the difference of the two unit vectors, in the measurements' frame."""
-        R, (d, known) = T[0, :3, :3], (np.asarray(v) / np.linalg.norm(v) for v in (self.in_camera, self.in_world))
+        R, (d, known) = se3.rotation(T[0]), (np.asarray(v) / np.linalg.norm(v) for v in (self.in_camera, self.in_world))
         return R @ d - known, np.hstack((-R @ so3.hat(d), np.zeros((3, 3))))
 
     @classmethod
     def of_row(cls, row: Sequence[float], mount: Mount) -> Self:
         """Make a reading of a line."""
-        x, y, z = (mount.T_cam_body[:3, :3] @ np.asarray(row[1:4])).tolist()
+        x, y, z = (se3.rotation(mount.T_cam_body) @ np.asarray(row[1:4])).tolist()
         return cls(row[0], (x, y, z), (row[4], row[5], row[6]), row[7])
 
     @classmethod
     def simulate(cls, times_s: Sequence[float], T: FloatArray, sigma: float, rng: Generator | None = None) -> Self:
         """Make the reading of gravity, which points along minus z."""
-        x, y, z = (so3.exp(noise(rng, sigma, 3)) @ T[0, :3, :3].T @ np.asarray(DOWN)).tolist()
+        x, y, z = (so3.exp(noise(rng, sigma, 3)) @ se3.rotation(T[0]).T @ np.asarray(DOWN)).tolist()
         return cls(times_s[0], (x, y, z), DOWN, sigma)
 
 
@@ -126,15 +127,17 @@ class Distance(Measurement):
 
     def residual(self, T: FloatArray, shared: FloatArray) -> Residual:
         """Return predicted minus measured distance, metres."""
-        d = T[1, :3, 3] - T[0, :3, 3]
+        d = se3.translation(T[1]) - se3.translation(T[0])
         length = float(np.linalg.norm(d))
-        u, none = d / max(length, 1e-12), np.zeros(3)
-        return np.array([length - self.distance_m]), np.hstack((none, -u @ T[0, :3, :3], none, u @ T[1, :3, :3]))[None]
+        u, none = d / max(length, TINY), np.zeros(3)
+        return np.array([length - self.distance_m]), np.hstack(
+            (none, -u @ se3.rotation(T[0]), none, u @ se3.rotation(T[1]))
+        )[None]
 
     @classmethod
     def simulate(cls, times_s: Sequence[float], T: FloatArray, sigma: float, rng: Generator | None = None) -> Self:
         """Make the reading that two true poses give."""
-        length = float(np.linalg.norm(T[1, :3, 3] - T[0, :3, 3]) + noise(rng, sigma, 1)[0])
+        length = float(np.linalg.norm(se3.translation(T[1]) - se3.translation(T[0])) + noise(rng, sigma, 1)[0])
         return cls(times_s[0], times_s[1], length, sigma)
 
 
@@ -159,12 +162,12 @@ class RelativePose(Measurement):
     @property
     def turn_rad(self) -> FloatArray:
         """Rotation vector of the body's motion."""
-        return so3.log(self.T_a_b[:3, :3])
+        return so3.log(se3.rotation(self.T_a_b))
 
     @property
     def distance_m(self) -> float:
         """Length of the motion."""
-        return float(np.linalg.norm(self.T_a_b[:3, 3]))
+        return float(np.linalg.norm(se3.translation(self.T_a_b)))
 
     def residual(self, T: FloatArray, shared: FloatArray) -> Residual:
         """Return the logarithm of the motion that is left over."""
@@ -198,7 +201,7 @@ class SamePlace(Measurement):
 
     def residual(self, T: FloatArray, shared: FloatArray) -> Residual:
         """Return the logarithm of the motion between the two poses."""
-        return between(T, np.eye(4), np.eye(4))
+        return between(T, se3.IDENTITY, se3.IDENTITY)
 
     @classmethod
     def simulate(cls, times_s: Sequence[float], T: FloatArray, sigma: float, rng: Generator | None = None) -> Self:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.random import Generator
 
 from dualslam.backend.measurements.base import Measurement, Mount, Residual, noise
-from dualslam.core.geometry import so3
+from dualslam.core.geometry import se3, so3
 from dualslam.core.types import FloatArray
 
 BIAS_SIGMA_RAD_S = 0.05
@@ -43,10 +43,10 @@ class RotationRate(Measurement):
 
     def residual(self, T: FloatArray, shared: FloatArray) -> Residual:
         """Return the rotation vector of the turn that is left over."""
-        B = self.mount.T_cam_body[:3, :3]
+        B = se3.rotation(self.mount.T_cam_body)
         effect = np.eye(3) * (self.t_b_s - self.t_a_s) if self.bias_effect_s is None else self.bias_effect_s
         unbiased = so3.exp(self.turn_rad) @ so3.exp(-effect @ shared)
-        R_b_a = B.T @ T[1, :3, :3].T @ T[0, :3, :3] @ B
+        R_b_a = B.T @ se3.rotation(T[1]).T @ se3.rotation(T[0]) @ B
         r = so3.log((R_b_a @ unbiased).T)
         J_r = so3.right_jacobian_inverse(r)
         J = np.zeros((3, 15))
@@ -64,7 +64,7 @@ class RotationRate(Measurement):
     @classmethod
     def simulate(cls, times_s: Sequence[float], T: FloatArray, sigma: float, rng: Generator | None = None) -> Self:
         """Make the turn between two true poses."""
-        turn = so3.exp(so3.log(T[0, :3, :3].T @ T[1, :3, :3])) @ so3.exp(noise(rng, sigma, 3))
+        turn = so3.exp(so3.log(se3.rotation(T[0]).T @ se3.rotation(T[1]))) @ so3.exp(noise(rng, sigma, 3))
         return cls(times_s[0], times_s[1], so3.log(turn), sigma)
 
     @classmethod

@@ -16,6 +16,7 @@ from dualslam.core.errors import InputError
 from dualslam.core.geometry import se3, sim3, so3
 from dualslam.core.geometry.umeyama import umeyama
 from dualslam.core.metric_problem import MeasurementSource, MetricProblem, pose_by_node
+from dualslam.core.noise_model import TINY
 from dualslam.core.types import Failure, FloatArray
 
 POSITION = "position"
@@ -82,7 +83,7 @@ def _check(source: MeasurementSource, path: CameraPath) -> None:
         together = first - times.min()
         advice = f"give --clock-offset SECONDS, which is added to them ({together:.1f} if both began together)"
         for unit, per_s in (("milliseconds", 1e3), ("microseconds", 1e6), ("nanoseconds", 1e9)):
-            if 0.5 < np.ptp(times) / (per_s * max(last - first, 1e-9)) < 2.0:
+            if 0.5 < np.ptp(times) / (per_s * max(last - first, TINY)) < 2.0:
                 advice = f"they seem to be in {unit}; write seconds"
         raise InputError(
             f"{source.name}: its times, {times.min():.1f} to {times.max():.1f} s, do not overlap those of the video, "
@@ -109,7 +110,7 @@ def _positions(path: CameraPath, source: MeasurementSource, offset_s: float) -> 
     if not known.any():
         return np.zeros((0, 3)), np.zeros((0, 3)), 0.0
     p, sigma = np.array([r.xyz_m for r in readings])[known], np.array([r.sigmas for r in readings])[known]
-    return path.at(times[known])[0][:, :3, 3], p, float(np.median(sigma))
+    return se3.translation(path.at(times[known])[0]), p, float(np.median(sigma))
 
 
 def _align(c: FloatArray, p: FloatArray, sigma: float, up: FloatArray | None) -> FloatArray | None:
@@ -123,7 +124,7 @@ def _align(c: FloatArray, p: FloatArray, sigma: float, up: FloatArray | None) ->
     found = None
     r = np.linalg.norm(p - np.median(p, axis=0), axis=1)
     for _ in range(N_ROUNDS):
-        w = (1.0 + (r / max(float(np.median(r)), 1e-9)) ** 2) ** -2
+        w = (1.0 + (r / max(float(np.median(r)), TINY)) ** 2) ** -2
         w /= w.sum()
         scale = np.sqrt((w @ (p - w @ p) ** 2).sum() / max(float((w @ (c - w @ c) ** 2).sum()), 1e-24))
         for above in (np.array([0.0, -1.0, 0.0]) if up is None else up, np.array([1.0, 0.0, 0.0])):
@@ -167,7 +168,7 @@ def _offset(path: CameraPath, source: MeasurementSource, up: FloatArray | None) 
     dof = len(inner) - 8 / 3  # a reading counts once; the similarity and the offset take eight of three numbers each
     if dof <= 0:
         return 0.0
-    ratio = (costs[0] / max(costs[best], 1e-12)) ** 2
+    ratio = (costs[0] / max(costs[best], TINY)) ** 2
     return float(grid[best]) if (ratio - 1.0) * dof > fdtri(1.0, dof, 0.99) else 0.0
 
 
@@ -192,7 +193,7 @@ def _turns(path: CameraPath, source: MeasurementSource, offset_s: float) -> tupl
     a, twist, _ = path.at(t[known, 0])
     b = path.at(t[known, 1])[0]
     at_once = t[known, 1] == t[known, 0]
-    turned = so3.log(a[:, :3, :3].swapaxes(1, 2) @ b[:, :3, :3])
+    turned = so3.log(se3.rotation(a).swapaxes(1, 2) @ se3.rotation(b))
     return measured, np.where(at_once[:, None], twist[:, :3], turned)
 
 
@@ -230,12 +231,12 @@ def _by_rigid_fits(
         signed = [np.diag(s) @ np.eye(3)[list(p)] for p in permutations(range(3)) for s in product((1, -1), repeat=3)]
         starts = [R for R in signed if np.linalg.det(R) > 0]
     apart = [
-        (t.reading.distance_m, float(np.linalg.norm(T[1, :3, 3] - T[0, :3, 3])))
+        (t.reading.distance_m, float(np.linalg.norm(se3.translation(T[1]) - se3.translation(T[0]))))
         for t, T in zip(terms, poses, strict=True)
         if hasattr(t.reading, "distance_m")
     ]
     s = float(np.median([length / seen for length, seen in apart if length > 0 and seen > 0] or [1.0]))
-    middle = np.median(problem.T_world_cam[:, :3, 3], axis=0)
+    middle = np.median(se3.translation(problem.T_world_cam), axis=0)
     every = max(len(terms) // N_SCREENED, 1)
     fits = [_rigid_fit(terms[::every], poses[::every], sim3.from_parts(s, R, middle - s * R @ middle)) for R in starts]
     return _rigid_fit(terms, poses, min(fits, key=lambda fit: fit[1])[0])[0]
@@ -256,5 +257,5 @@ def _rigid_fit(terms: Sequence[Term], T_world: Sequence[FloatArray], S: FloatArr
             H += weight * J.T @ J
             g += weight * J.T @ r
         step = -np.linalg.solve(H, g)
-        S = S @ sim3.exp(step * min(1.0, 1.0 / max(float(np.abs(step[[0, 1, 2, 6]]).max()), 1e-12)))
+        S = S @ sim3.exp(step * min(1.0, 1.0 / max(float(np.abs(step[[0, 1, 2, 6]]).max()), TINY)))
     return S, cost

@@ -9,7 +9,7 @@ from enum import StrEnum
 import numpy as np
 
 from dualslam.atlas.warp import Warp
-from dualslam.core.geometry import sim3
+from dualslam.core.geometry import se3, sim3
 from dualslam.core.types import FloatArray
 from dualslam.map.submap import Submap
 
@@ -71,7 +71,7 @@ class Link:
         middle = shared[len(shared) // 2]
         covariance = rollover_covariance(following, middle)
         return cls(
-            full.id, following.id, np.eye(4), covariance, LinkKind.ROLLOVER, shared, middle, middle, doubtful=False
+            full.id, following.id, se3.IDENTITY, covariance, LinkKind.ROLLOVER, shared, middle, middle, doubtful=False
         )
 
     @classmethod

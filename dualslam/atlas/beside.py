@@ -208,7 +208,7 @@ def _much_as_it_was(submap: Submap, rows: list[int], knots: list[int], T_then: F
 
 def _poses(atlas: Atlas, link: Link, ends: tuple[int, int]) -> tuple[FloatArray, FloatArray]:
     """Return the poses of the keyframes that a link stands between; those that were culled are still known."""
-    T_a, T_b = (atlas.submaps[m].resolve_anchor(k, np.eye(4)) for m, k in zip((link.a, link.b), ends, strict=True))
+    T_a, T_b = (atlas.submaps[m].resolve_anchor(k, se3.IDENTITY) for m, k in zip((link.a, link.b), ends, strict=True))
     return T_a, T_b
 
 

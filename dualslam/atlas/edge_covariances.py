@@ -25,9 +25,9 @@ Covariances = Callable[[Submap, Sequence[tuple[int, int]], frozenset[int]], Floa
 
 def much_alike(then: FloatArray, now: FloatArray) -> BoolArray:
     """Return (...) for which edges (..., 4, 4) the covariance of before still holds."""
-    change, way = np.abs(now - then), np.linalg.norm(then[..., :3, 3], axis=-1)
-    turned_alike = change[..., :3, :3].max(axis=(-2, -1)) < SAME_TURN_RAD
-    return np.asarray(turned_alike & (change[..., :3, 3].max(axis=-1) < SAME_WAY * way))
+    change, way = np.abs(now - then), np.linalg.norm(se3.translation(then), axis=-1)
+    turned_alike = se3.rotation(change).max(axis=(-2, -1)) < SAME_TURN_RAD
+    return np.asarray(turned_alike & (se3.translation(change).max(axis=-1) < SAME_WAY * way))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

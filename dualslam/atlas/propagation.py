@@ -44,7 +44,7 @@ def propagate_anchors(before: Submap, after: Submap) -> None:
     known = [k for k in after.anchors if k in before.anchors or k in before.keyframes]
     if not known:
         return
-    ids, T_kf_cam = _propagate(known, np.array([before.resolve_anchor(k, np.eye(4)) for k in known]), before, after)
+    ids, T_kf_cam = _propagate(known, np.array([before.resolve_anchor(k, se3.IDENTITY) for k in known]), before, after)
     for k, reference, T in zip(known, ids.tolist(), T_kf_cam, strict=True):
         after.anchors[k] = Anchor(reference, T)
 
@@ -58,7 +58,7 @@ def _propagate(
     here = np.searchsorted(keyframe_ids, np.asarray(index, np.int64))
     a, b = np.maximum(here - 1, 0), np.minimum(here, len(keyframe_ids) - 1)
     T_a, T_b = (se3.inverse(was[at]) @ T_submap_cam for at in (a, b))
-    from_a, from_b = (np.linalg.norm(T[:, :3, 3], axis=1) for T in (T_a, T_b))
+    from_a, from_b = (np.linalg.norm(se3.translation(T), axis=1) for T in (T_a, T_b))
     share = np.divide(from_a, from_a + from_b, out=np.zeros(len(a)), where=from_a + from_b > 0)
     share[a == b] = 0.0
     T_a_b = se3.inverse(now[a]) @ now[b]

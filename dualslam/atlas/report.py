@@ -16,7 +16,7 @@ from dualslam.atlas.skeleton import WITHIN, Skeleton
 from dualslam.atlas.warp import Warp
 from dualslam.core.atlas_problem import AtlasSolution
 from dualslam.core.events import EventKind
-from dualslam.core.geometry import sim3
+from dualslam.core.geometry import se3, sim3
 from dualslam.core.types import Failure
 
 STILL = 1e-4
@@ -130,7 +130,7 @@ def moves_of(skeleton: Skeleton, solution: AtlasSolution) -> list[Move]:
         S = sim3.inverse(S_world_submap) @ solution.S_world_node[rows] @ sim3.inverse(T)
         bent = bool(np.abs(sim3.log(S)).max() > STILL)
         warp = Warp(np.array(knots, np.int64), sim3.normalise(S))
-        centres = T[:, :3, 3]
+        centres = se3.translation(T)
         bend_mu = float(np.linalg.norm(sim3.act_each(S, centres) - centres, axis=1).max())
         moves.append(Move(m, warp, S_world_submap, bend_mu, bent, skeleton.steps[m]))
     return moves

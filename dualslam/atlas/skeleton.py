@@ -229,7 +229,7 @@ def _inflated(T: FloatArray, depth: FloatArray, covariances: FloatArray) -> Floa
     - `T` (E, 4, 4): from the second keyframe to the first.
     - `depth` (E,): of the scene at the second.
     """
-    motion = np.linalg.norm(so3.log(T[:, :3, :3]), axis=1) + np.linalg.norm(T[:, :3, 3], axis=1) / depth
+    motion = np.linalg.norm(so3.log(se3.rotation(T)), axis=1) + np.linalg.norm(se3.translation(T), axis=1) / depth
     units = np.ones((len(T), 7))
     units[:, 3:6] = depth[:, None]
     model: FloatArray = (MODEL_SHARE * motion[:, None] * units) ** 2

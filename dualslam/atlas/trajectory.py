@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from dualslam.atlas.atlas import Atlas
-from dualslam.core.geometry import sim3, so3
+from dualslam.core.geometry import se3, sim3, so3
 from dualslam.core.trajectory import Trajectory
 from dualslam.core.types import BoolArray, FloatArray, IntArray
 from dualslam.map.anchors import Anchor
@@ -62,7 +62,7 @@ class Path:
     @property
     def centres(self) -> FloatArray:
         """Where the camera was, (N, 3)."""
-        return self.T_map_cam[:, :3, 3]
+        return se3.translation(self.T_map_cam)
 
     def way_between(self, i: int, j: int) -> float:
         """Return the length of the way between two frames, given by their indices."""
@@ -92,9 +92,9 @@ class Path:
         if len(mine) < min_frames:
             return None
         a, b = other.T_map_cam[theirs], self.T_map_cam[mine]
-        R = so3.orthonormalise((a[:, :3, :3] @ b[:, :3, :3].swapaxes(1, 2)).sum(axis=0))
-        mean_a, mean_b = a[:, :3, 3].mean(axis=0), b[:, :3, 3].mean(axis=0)
-        spread_a, spread_b = np.linalg.norm(a[:, :3, 3] - mean_a), np.linalg.norm(b[:, :3, 3] - mean_b)
+        R = so3.orthonormalise((se3.rotation(a) @ se3.rotation(b).swapaxes(1, 2)).sum(axis=0))
+        mean_a, mean_b = se3.translation(a).mean(axis=0), se3.translation(b).mean(axis=0)
+        spread_a, spread_b = np.linalg.norm(se3.translation(a) - mean_a), np.linalg.norm(se3.translation(b) - mean_b)
         if not spread_a * spread_b > 0:
             return None
         s = spread_a / spread_b

@@ -56,3 +56,5 @@ MAX_TRIES = 3
 UNSURE_SCALE = 0.1
 """Standard deviation of the logarithm of the size of two seconds of the path: with more it is off by 20 % with a
 probability above 5 %. What is off by so much is too large or too small to be measured in."""
+TINY = 1e-12
+"""A divisor in place of zero."""

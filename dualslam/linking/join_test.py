@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 
 from dualslam.core.config.settings import LinkingConfig
 from dualslam.core.decisions import Gate
-from dualslam.core.noise_model import GATE_SIGMAS, MAJORITY, MAX_SLIP
+from dualslam.core.noise_model import GATE_SIGMAS, MAJORITY, MAX_SLIP, TINY
 from dualslam.core.types import Failure, FailureReason
 from dualslam.linking.motion import Motion
 
@@ -201,7 +201,7 @@ def judge_motion(motions: Iterable[Motion]) -> LinkEvidence:
 
 def motion_gate(motion: Motion) -> JoinGate:
     """Return the gate of one motion: off by no more than the run itself explains."""
-    times = motion.off_mu / max(motion.usual_mu, 1e-12)
+    times = motion.off_mu / max(motion.usual_mu, TINY)
     detail = f"the camera is {times:.0f} times further from where its velocities lead than elsewhere"
     compared = (Gate("leap_off", motion.off_mu, "<=", motion.allowed_mu),)
     logged = {"leap_usual": motion.usual_mu, "leap_asked": float(motion.n_asked)}

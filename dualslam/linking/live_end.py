@@ -127,7 +127,7 @@ def _log_spread(T: FloatArray, rows: IntArray) -> float:
 
 def _mean_turn(T_now: FloatArray, T_other: FloatArray) -> FloatArray:
     """Return the mean rotation from the current keyframes to where they would be."""
-    turns = T_other[:, :3, :3] @ T_now[:, :3, :3].swapaxes(1, 2)
+    turns = se3.rotation(T_other) @ se3.rotation(T_now).swapaxes(1, 2)
     middle = turns[len(turns) // 2]
     mean = np.mean([so3.log(middle.T @ turn) for turn in turns], axis=0)
     return np.asarray(middle @ so3.exp(mean), np.float64)
@@ -178,7 +178,7 @@ def _carry(
     if not evidence.is_accepted:
         return refused
     held = [k for k in link.agreeing_keyframes.tolist() if k in new.keyframes]
-    about = sim3.adjoint(se3.from_parts(np.eye(3), new.keyframe_poses(held)[:, :3, 3].mean(0)))
+    about = sim3.adjoint(se3.from_parts(np.eye(3), se3.translation(new.keyframe_poses(held)).mean(0)))
     C = np.diag([lost.rotation_rad**2] * 3 + [0.0] * 3 + [lost.log_scale**2])
     sigma = math.hypot(link.sigma_scale, lost.log_scale)
     carried = replace(

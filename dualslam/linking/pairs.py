@@ -80,7 +80,7 @@ def pixel_chi2(
     K: FloatArray, T_cam_w: FloatArray, xyz: FloatArray, covariance: FloatArray, uv: FloatArray, sigma: FloatArray
 ) -> FloatArray:
     """Return squared residuals (V,) whitened by the pixels' sigmas and the points' covariances projected."""
-    R = T_cam_w[:, :3, :3]
+    R = se3.rotation(T_cam_w)
     p = se3.act_each(T_cam_w, xyz)
     z = np.where(p[:, 2] > 0, p[:, 2], np.nan)
     focal = np.array([K[0, 0], K[1, 1]])

@@ -14,6 +14,7 @@ import numpy as np
 from scipy.spatial.distance import pdist
 
 from dualslam.atlas.trajectory import Path
+from dualslam.core.geometry import se3
 from dualslam.core.types import Failure, FailureReason, FloatArray, Rival
 from dualslam.linking.join_test import judge_motion
 from dualslam.linking.motion import Motion, gaps_of, measure_motion
@@ -82,7 +83,7 @@ def _measure(walked: Path, known: Path, rivals: Sequence[Rival]) -> tuple[list[M
     path = known.take(known.times_s < after_s).then(walked)
     n_beyond = int(np.searchsorted(path.times_s, after_s))
     motions, places = [], []
-    for T_moves in (np.eye(4), *(rival.T_rival_walked for rival in rivals)):
+    for T_moves in (se3.IDENTITY, *(rival.T_rival_walked for rival in rivals)):
         T = np.concatenate([T_moves @ path.T_map_cam[:n_beyond], path.T_map_cam[n_beyond:]])
         motion = measure_motion(replace(path, T_map_cam=T), n_beyond - 1, known) if n_beyond else None
         if motion is None or motion.n_sides < 2:

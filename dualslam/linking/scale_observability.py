@@ -274,9 +274,9 @@ def _size_at(problem: _Problem, ids: IntArray) -> FloatArray:
     """Return the derivative (6 F,) of the log of the path's size at some keyframes by the poses."""
     rows = np.searchsorted(problem.ids, ids)
     T = problem.T_cam_submap[rows]
-    offset = se3.inverse(T)[:, :3, 3]
+    offset = se3.translation(se3.inverse(T))
     offset = offset - offset.mean(axis=0)
     squares = max(float((offset**2).sum()), np.finfo(float).tiny)
     by_pose = np.zeros((len(problem.ids), 6))
-    by_pose[rows, 3:] = -np.einsum("nij,nj->ni", T[:, :3, :3], offset) / squares
+    by_pose[rows, 3:] = -np.einsum("nij,nj->ni", se3.rotation(T), offset) / squares
     return by_pose.reshape(-1)

@@ -40,10 +40,10 @@ def ask_keyframes(model: PairModel, S_old_new: FloatArray, config: LinkingConfig
     near = model.mahalanobis2(S_old_new) < PAIR_CHI2
     share = c.count_by_keyframe(near[c.view_pair]) / per
     T_moved = sim3.act_on_pose(S_old_new, model.T_new_kf)
-    turn = so3.log(T_moved[:, :3, :3].swapaxes(1, 2) @ model.T_old_kf[:, :3, :3])
+    turn = so3.log(se3.rotation(T_moved).swapaxes(1, 2) @ se3.rotation(model.T_old_kf))
     rotation = np.sqrt((turn**2).sum(1))
-    centres = model.T_old_kf[:, :3, 3]
-    apart = np.linalg.norm(T_moved[:, :3, 3] - centres, axis=1)
+    centres = se3.translation(model.T_old_kf)
+    apart = np.linalg.norm(se3.translation(T_moved) - centres, axis=1)
     distance = np.linalg.norm(c.xyz_old[c.view_pair] - centres[c.view_keyframe], axis=1)
     depth = np.array([np.median(distance[c.view_keyframe == k]) for k in range(len(c.keyframes))])
     reach = np.maximum(depth, np.linalg.norm(centres - model.centre_old, axis=1))

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from dualslam.core.geometry import se3
 from dualslam.core.types import FloatArray
 
 
@@ -27,9 +28,10 @@ class RelativePose:
 
     def scaled(self, scale: float) -> RelativePose:
         """Return the same in another unit of length."""
-        T, units = self.T_ref_kf.copy(), np.repeat([1.0, scale], 3)
-        T[:3, 3] *= scale
-        return RelativePose(self.keyframe_id, T, units[:, None] * self.covariance * units)
+        units = np.repeat([1.0, scale], len(self.covariance) // 2)
+        return RelativePose(
+            self.keyframe_id, se3.scaled(self.T_ref_kf, scale), units[:, None] * self.covariance * units
+        )
 
     def seen_from(self, keyframe_id: int, T_kf_ref: FloatArray) -> RelativePose:
         """Return the same relative to another keyframe, of which the old one's place is known."""

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from dualslam.core.geometry import sim3
+from dualslam.core.geometry import se3, sim3
 from dualslam.core.types import Failure, FloatArray, FrameMethod, FrameStatus
 
 
@@ -91,7 +91,7 @@ class FrameResult:
     def position(self) -> FloatArray | None:
         """(3,) camera centre in the world, in its unit; None without a pose."""
         T = self.T_world_cam
-        return None if T is None else T[:3, 3]
+        return None if T is None else se3.translation(T)
 
     @property
     def lost(self) -> str | None:

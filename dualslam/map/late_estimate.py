@@ -64,5 +64,5 @@ def _move_points(submap: Submap, before: Submap, known: IntArray, landmark_ids: 
     moves = submap.keyframe_poses(all_ids) @ S_cam @ se3.inverse(before.keyframe_poses(all_ids))
     of_each = moves[place]
     xyz = before.landmarks["xyz_mu"][ids]
-    lm["xyz_mu"][ids] = np.einsum("nij,nj->ni", of_each[:, :3, :3], xyz) + of_each[:, :3, 3]
+    lm["xyz_mu"][ids] = np.einsum("nij,nj->ni", se3.rotation(of_each), xyz) + se3.translation(of_each)
     lm["distance_mu"][ids] *= scale

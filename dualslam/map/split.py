@@ -6,6 +6,7 @@ from collections.abc import Iterable
 
 import numpy as np
 
+from dualslam.core.geometry import se3
 from dualslam.core.types import IntArray
 from dualslam.map.submap import NO_LANDMARK, Submap
 
@@ -93,7 +94,7 @@ def _widest_pair(submap: Submap, keyframe_ids: list[int]) -> tuple[int, int]:
 
     The first and the last one may stand side by side, where a hand moves to and fro.
     """
-    centres = submap.keyframe_poses(keyframe_ids)[:, :3, 3]
+    centres = se3.translation(submap.keyframe_poses(keyframe_ids))
     apart = np.linalg.norm(centres[:, None] - centres, axis=2)
     first, second = np.unravel_index(int(apart.argmax()), apart.shape)
     return keyframe_ids[int(first)], keyframe_ids[int(second)]

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dualslam.core.geometry import se3
+from dualslam.core.noise_model import TINY
 from dualslam.core.types import BoolArray, FloatArray, IntArray, Keyframe, Start, Track
 from dualslam.map.anchors import Anchor, RelativePose
 from dualslam.map.tables import Table, landmark_table, observation_table
@@ -168,14 +169,14 @@ class Submap:
         self, xyz_mu: FloatArray, descriptors: NDArray[Any], scale: FloatArray, keyframe_id: int
     ) -> IntArray:
         """Append landmarks first described in `keyframe_id` (scale: of the feature there); return their ids."""
-        to_camera = self.T_submap_kf[keyframe_id][:3, 3] - xyz_mu
+        to_camera = se3.translation(self.T_submap_kf[keyframe_id]) - xyz_mu
         distance = np.linalg.norm(to_camera, axis=1)
         return self.landmarks.append(
             len(xyz_mu),
             xyz_mu=xyz_mu,
             alive=True,
             descriptor=descriptors,
-            normal=to_camera / np.maximum(distance, 1e-12)[:, None],
+            normal=to_camera / np.maximum(distance, TINY)[:, None],
             distance_mu=distance,
             scale=scale,
             first_kf=keyframe_id,
@@ -378,16 +379,11 @@ class Submap:
 
     def transform(self, scale: float, T_new_old: FloatArray) -> None:
         """Apply ``p_new = scale * R p + t`` to all poses and points (a change of gauge)."""
-        R, t = T_new_old[:3, :3], T_new_old[:3, 3]
+        R, t = se3.rotation(T_new_old), se3.translation(T_new_old)
         for k, T in self.T_submap_kf.items():
-            moved = np.eye(4)
-            moved[:3, :3] = R @ T[:3, :3]
-            moved[:3, 3] = scale * R @ T[:3, 3] + t
-            self.T_submap_kf[k] = moved
+            self.T_submap_kf[k] = se3.from_parts(R @ se3.rotation(T), scale * R @ se3.translation(T) + t)
         for k, anchor in self.anchors.items():
-            T_kf_cam = anchor.T_kf_cam.copy()
-            T_kf_cam[:3, 3] *= scale
-            self.anchors[k] = Anchor(anchor.keyframe_id, T_kf_cam)
+            self.anchors[k] = Anchor(anchor.keyframe_id, se3.scaled(anchor.T_kf_cam, scale))
         self.relative_poses = {k: known.scaled(scale) for k, known in self.relative_poses.items()}
         lm = self.landmarks
         lm["xyz_mu"][:] = scale * lm["xyz_mu"] @ R.T + t
@@ -417,9 +413,9 @@ class Submap:
         centres = np.full((len(keyframe_ids), 3), np.nan)
         for row, k in enumerate(keyframe_ids.tolist()):
             if k in self.T_submap_kf:
-                centres[row] = self.T_submap_kf[k][:3, 3]
+                centres[row] = se3.translation(self.T_submap_kf[k])
             elif k in self.anchors:
-                centres[row] = self.resolve_anchor(k, np.eye(4))[:3, 3]
+                centres[row] = se3.translation(self.resolve_anchor(k, se3.IDENTITY))
         return centres
 
     def copy(self) -> Submap:

@@ -30,12 +30,12 @@ def change_of_frame(
     if not shared:
         raise ValueError(f"submap {before.id}: none of the keyframes stands in both states")
     T_before, T_after = before.keyframe_poses(shared), after.keyframe_poses(shared)
-    R = so3.orthonormalise((T_after[:, :3, :3] @ T_before[:, :3, :3].transpose(0, 2, 1)).sum(0))
+    R = so3.orthonormalise((se3.rotation(T_after) @ se3.rotation(T_before).transpose(0, 2, 1)).sum(0))
     n = min(len(before.landmarks), len(after.landmarks), len(before.landmarks) if n_landmarks is None else n_landmarks)
     ratios = [_depth_ratios(before, after, k, n) for k in shared]
     together = np.concatenate(ratios)
     scale = float(np.median(together)) if len(together) else 1.0
-    t = (T_after[:, :3, 3] - scale * T_before[:, :3, 3] @ R.T).mean(0)
+    t = (se3.translation(T_after) - scale * se3.translation(T_before) @ R.T).mean(0)
     return sim3.from_parts(scale, R, t)
 
 

@@ -9,8 +9,8 @@ import numpy as np
 from dualslam.atlas.atlas import Atlas
 from dualslam.atlas.record import Record
 from dualslam.atlas.trajectory import Path, compose
-from dualslam.core.geometry import sim3
-from dualslam.core.noise_model import MAX_SLIP, SAME_WITHIN
+from dualslam.core.geometry import se3, sim3
+from dualslam.core.noise_model import MAX_SLIP, SAME_WITHIN, TINY
 from dualslam.core.types import Failure, FloatArray
 from dualslam.linking.join_test import LinkEvidence, drift_gate, judge_motion
 from dualslam.linking.motion import join_slack, seam_motions
@@ -60,9 +60,9 @@ def plausible(record: Record, match: PlaceMatch) -> PlaceMatch | Failure:
     by_chain, by_pixels = sim3.act_on_pose(S_a_b, T_b_cam), sim3.act_on_pose(match.S_place_query, T_b_cam)
     log_scale = float(np.log(sim3.scale(match.S_place_query) / sim3.scale(S_a_b)))
     way = _way(atlas, component, S_world, k_a, k_b) / float(sim3.scale(S_world[a]))
-    apart = float(np.linalg.norm(by_chain[:3, 3] - by_pixels[:3, 3]))
+    apart = float(np.linalg.norm(se3.translation(by_chain) - se3.translation(by_pixels)))
     turn_deg = float(np.degrees(turn_between(by_chain, by_pixels)))
-    evidence = LinkEvidence((drift_gate(apart / max(way, 1e-12), turn_deg, log_scale),))
+    evidence = LinkEvidence((drift_gate(apart / max(way, TINY), turn_deg, log_scale),))
     match.numbers.update(evidence.numbers)
     refused = evidence.refusal(match.numbers)
     return match if refused is None else refused
@@ -75,7 +75,7 @@ def reachable(record: Record, match: PlaceMatch) -> PlaceMatch | Failure:
     """
     (a, k_a), (b, k_b) = match.place, match.query
     atlas, S_a = record.atlas, dict[int, FloatArray]()
-    for m, S_a_m in ((a, np.eye(4)), (b, match.S_place_query)):
+    for m, S_a_m in ((a, se3.IDENTITY), (b, match.S_place_query)):
         component = atlas.component_of(m)
         S_world = atlas.S_world_submap(component)
         S_a |= {other: S_a_m @ sim3.inverse(S_world[m]) @ S_world[other] for other in component}
@@ -106,6 +106,6 @@ def _way(atlas: Atlas, component: list[int], S_world: dict[int, FloatArray], fir
     for m in component:
         for k, T in atlas.submaps[m].T_submap_kf.items():
             if first <= k <= last and k not in centres:
-                centres[k] = sim3.act(S_world[m], T[None, :3, 3])[0]
+                centres[k] = sim3.act(S_world[m], se3.translation(T[None]))[0]
     ordered = np.array([centres[k] for k in sorted(centres)])
     return float(np.linalg.norm(np.diff(ordered, axis=0), axis=1).sum())

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from dualslam.core.geometry import se3, sim3
 from dualslam.core.geometry.alignment import estimate_sim3_robust
-from dualslam.core.noise_model import GROUP, MIN_CONSENSUS, SAME_WITHIN
+from dualslam.core.noise_model import GROUP, MIN_CONSENSUS, SAME_WITHIN, TINY
 from dualslam.core.place_matcher import PlaceMatcher, Sighting
 from dualslam.core.types import BoolArray, Failure, FloatArray, IntArray
 from dualslam.map.submap import Submap
@@ -118,7 +118,7 @@ def image_spread(submap: Submap, keyframes: tuple[int, ...], landmark_ids: IntAr
         uv = submap.keyframes[k].features.uv_rect_px
         seen = uv[np.isin(submap.landmark_of[k], landmark_ids)]
         covered, there = (np.ptp(np.percentile(pixels, [5, 95], axis=0), axis=0) for pixels in (seen, uv))
-        best = max(best, float((covered / np.maximum(there, 1e-9)).min()))
+        best = max(best, float((covered / np.maximum(there, TINY)).min()))
     return best
 
 
@@ -127,13 +127,13 @@ def sigmas_at_pairs(xyz_query: FloatArray, S: FloatArray, covariance: FloatArray
     at_centre = sim3.adjoint(se3.from_parts(np.eye(3), -np.median(xyz_query, axis=0)))
     C = at_centre @ covariance @ at_centre.T
     depth = np.median(
-        np.linalg.norm(sim3.act(S, xyz_query) - place.submap.T_submap_kf[place.keyframes[0]][:3, 3], axis=1)
+        np.linalg.norm(sim3.act(S, xyz_query) - se3.translation(place.submap.T_submap_kf[place.keyframes[0]]), axis=1)
     )
     position = float(sim3.scale(S)) * math.sqrt(np.linalg.eigvalsh(C[3:6, 3:6])[-1])
     return {
         "sigma_scale": math.sqrt(C[6, 6]),
         "sigma_rot_deg": math.degrees(math.sqrt(np.linalg.eigvalsh(C[:3, :3])[-1])),
-        "sigma_trans_rel": position / max(float(depth), 1e-12),
+        "sigma_trans_rel": position / max(float(depth), TINY),
     }
 
 

@@ -212,9 +212,11 @@ def median_depth(submap: Submap, track: Track) -> float:
 
 def turn_between(T_a: FloatArray, T_b: FloatArray) -> float:
     """Return the angle between two poses, radians."""
-    return float(so3.rotation_angle(T_a[:3, :3].T @ T_b[:3, :3]))
+    return float(so3.rotation_angle(se3.rotation(T_a).T @ se3.rotation(T_b)))
 
 
 def same_pose(T_a: FloatArray, T_b: FloatArray, within: float) -> bool:
     """Whether two poses, camera to map, are one: within a distance and `SAME_TURN_RAD`."""
-    return bool(np.linalg.norm(T_a[:3, 3] - T_b[:3, 3]) < within and turn_between(T_a, T_b) < SAME_TURN_RAD)
+    return bool(
+        np.linalg.norm(se3.translation(T_a) - se3.translation(T_b)) < within and turn_between(T_a, T_b) < SAME_TURN_RAD
+    )

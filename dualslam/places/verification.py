@@ -202,7 +202,7 @@ class PlaceVerifier:
 
     def _own_found(self, place: Side) -> float:
         """Share of what a place should show that its own images show, where it is as much as can be had: the middle."""
-        return float(np.median([self._look(place, place.submap, k, np.eye(4)).share for k in place.keyframes]))
+        return float(np.median([self._look(place, place.submap, k, se3.IDENTITY).share for k in place.keyframes]))
 
     def _look(self, seen: Side, looking: Submap, keyframe_id: int, S_seen_looking: FloatArray) -> Sighting:
         T_seen_cam = sim3.act_on_pose(S_seen_looking, looking.T_submap_kf[keyframe_id])

@@ -7,8 +7,8 @@ from dataclasses import replace
 
 from dualslam.atlas.propagation import propagate_poses
 from dualslam.atlas.record import Record
-from dualslam.core.geometry import sim3
-from dualslam.core.types import FloatArray, FrameStatus
+from dualslam.core.geometry import se3, sim3
+from dualslam.core.types import FrameStatus
 from dualslam.map.frame_observations import Change
 from dualslam.map.submap import Submap
 from dualslam.recovery.job import RecoveredFrame
@@ -26,7 +26,7 @@ def pose_frames(
     - `change`: see `merge_recovery`.
     """
     scale = float(sim3.scale(merged.S_live_grown))
-    scaled = [replace(frame.pose, T_kf_cam=_scaled(frame.pose.T_kf_cam, scale)) for frame in frames]
+    scaled = [replace(frame.pose, T_kf_cam=se3.scaled(frame.pose.T_kf_cam, scale)) for frame in frames]
     carried = {pose.index: pose for pose in propagate_poses(scaled, merged.moved, submap)}
     recovered_frames = []
     for frame, pose in zip(frames, scaled, strict=True):
@@ -83,9 +83,3 @@ def condemn_tail(
     tail = {k for k in submap.keyframes if k >= since or (k > handover and k in own)}
     submap.condemn(tail)
     return len(submap.condemned)
-
-
-def _scaled(T: FloatArray, scale: float) -> FloatArray:
-    scaled = T.copy()
-    scaled[:3, 3] *= scale
-    return scaled

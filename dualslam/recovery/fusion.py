@@ -8,7 +8,7 @@ from dualslam.atlas.atlas import Link, LinkKind
 from dualslam.atlas.connections import Connections
 from dualslam.atlas.record import FrameStamp, Record
 from dualslam.core.events import EventKind
-from dualslam.core.geometry import sim3
+from dualslam.core.geometry import se3, sim3
 from dualslam.core.types import Failure, FailureReason, FloatArray, FrameStatus, IntArray
 from dualslam.map.submap import Submap
 from dualslam.map.submap_change import change_of_frame
@@ -104,8 +104,10 @@ def gauge_at_overlap(submap: Submap, keyframe_ids: IntArray) -> tuple[int, int]:
     if len(ids) < 2:
         return submap.gauge
     newest = ids[-1]
-    reach = np.linalg.norm(submap.keyframe_poses(ids)[:, :3, 3] - submap.T_submap_kf[newest][:3, 3], axis=1)
-    in_use = [submap.resolve_anchor(k, np.eye(4))[:3, 3] for k in submap.gauge]
+    reach = np.linalg.norm(
+        se3.translation(submap.keyframe_poses(ids)) - se3.translation(submap.T_submap_kf[newest]), axis=1
+    )
+    in_use = [se3.translation(submap.resolve_anchor(k, se3.IDENTITY)) for k in submap.gauge]
     if reach.max() <= np.linalg.norm(in_use[0] - in_use[1]):
         return submap.gauge
     return newest, ids[int(np.argmax(reach))]

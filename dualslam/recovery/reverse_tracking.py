@@ -21,6 +21,7 @@ from dualslam.core.config.settings import HealthConfig
 from dualslam.core.errors import SolverError
 from dualslam.core.estimates import KeyframeReport
 from dualslam.core.events import Event, EventKind
+from dualslam.core.geometry import se3
 from dualslam.core.interfaces import VisualOdometry
 from dualslam.core.jobs import Limit, result_of
 from dualslam.core.support import judge_track
@@ -213,7 +214,7 @@ def _walk(job: RecoveryJob, parts: RecoveryParts, attempt: Attempt, tries: LinkT
     max_gap_frames = parts.config.recovery.max_gap_frames if job.lost else len(job.views)
     views = job.views if job.lost else _there_and_back(job.views, walk)
     unsure_of: int | None = None  # the lost map with which a link would be, but for a loose scale
-    trace = WalkTrace(submap.id, attempt.name, job.newest_id, submap.T_submap_kf[job.newest_id][:3, 3])
+    trace = WalkTrace(submap.id, attempt.name, job.newest_id, se3.translation(submap.T_submap_kf[job.newest_id]))
     limits = max_gap_frames, attempt.max_unrecognised
     for step in track_in_reverse(reverse_tracker, views, parts.config.health, relinker.keyframe_ids, *limits):
         trace.note(step.view, step.track)

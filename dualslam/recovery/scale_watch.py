@@ -17,8 +17,9 @@ from scipy.special import ndtri
 
 from dualslam.atlas.atlas import Link
 from dualslam.core.config.settings import LinkingConfig
+from dualslam.core.geometry import se3
 from dualslam.core.jobs import Desk, Handlers, InlineDesk, JobKind
-from dualslam.core.noise_model import GROUP
+from dualslam.core.noise_model import GROUP, TINY
 from dualslam.core.types import Failure, FloatArray, IntArray
 from dualslam.linking.scale_observability import N_AROUND, SCALE_INFLATION, ScaleQuestion, answer_scale, ask_scale
 from dualslam.map.submap import Submap
@@ -163,8 +164,8 @@ def _parallax_rad(submap: Submap, keyframe_ids: list[int]) -> FloatArray:
     for k in keyframe_ids:
         seen = submap.landmark_of[k]
         seen = seen[seen >= 0]
-        ray = xyz[seen] - submap.T_submap_kf[k][:3, 3]
-        ray /= np.maximum(np.linalg.norm(ray, axis=1, keepdims=True), 1e-12)
+        ray = xyz[seen] - se3.translation(submap.T_submap_kf[k])
+        ray /= np.maximum(np.linalg.norm(ray, axis=1, keepdims=True), TINY)
         new = np.isnan(first[seen, 0])
         first[seen[new]] = ray[new]
         cosine[seen] = np.minimum(cosine[seen], np.einsum("ij,ij->i", first[seen], ray))

@@ -70,8 +70,8 @@ class PoseCovariance:
             by_pose, own = -(ties @ flat.T).T, pixels + flat @ flat.T
         first, second = _gauge(submap)
         a, b = np.searchsorted(kf, (first, second)).tolist()
-        baseline = submap.T_submap_kf[second][:3, 3] - submap.T_submap_kf[first][:3, 3]
-        along = submap.T_submap_kf[second][:3, :3].T @ baseline / (baseline @ baseline)
+        baseline = se3.translation(submap.T_submap_kf[second]) - se3.translation(submap.T_submap_kf[first])
+        along = se3.rotation(submap.T_submap_kf[second]).T @ baseline / (baseline @ baseline)
         information[6 * b + 3 : 6 * b + 6, 6 * b + 3 : 6 * b + 6] += np.outer(along, along) / BASELINE_SIGMA**2
         free = np.delete(np.arange(6 * len(kf)), np.arange(6 * a, 6 * a + 6))
         try:
@@ -104,11 +104,11 @@ def _without_landmarks(submap: Submap, kf: IntArray) -> tuple[_Points, bsr_array
     landmark, pose = submap.observations["landmark"][rows], np.searchsorted(kf, submap.observations["kf"][rows])
     _, sigma = submap.observed_pixels(rows)
     T = se3.inverse(submap.keyframe_poses(kf))[pose]
-    p = np.einsum("rij,rj->ri", T[:, :3, :3], submap.landmarks["xyz_mu"][landmark]) + T[:, :3, 3]
+    p = np.einsum("rij,rj->ri", se3.rotation(T), submap.landmarks["xyz_mu"][landmark]) + se3.translation(T)
     front = p[:, 2] > 0
     landmark, pose, sigma, T, p = landmark[front], pose[front], sigma[front, None, None], T[front], p[front]
-    J_pose, J_cam = projection_jacobians(submap.K, np.eye(4), p)
-    J_pose, J_point = J_pose / sigma, J_cam @ T[:, :3, :3] / sigma
+    J_pose, J_cam = projection_jacobians(submap.K, se3.IDENTITY, p)
+    J_pose, J_point = J_pose / sigma, J_cam @ se3.rotation(T) / sigma
     ids, point = np.unique(landmark, return_inverse=True)
     V = sum_by(point, J_point.transpose(0, 2, 1) @ J_point, len(ids))
     spread = np.linalg.eigvalsh(V)

@@ -233,7 +233,7 @@ class Starting:
         for k, keyframe in submap.keyframes.items():
             seen = FrameObservations.of(keyframe.features, submap.landmark_of[k], submap.id)
             n = len(seen.landmark_ids)
-            pose = FramePose(k, keyframe.timestamp_s, submap.id, k, np.eye(4))
+            pose = FramePose(k, keyframe.timestamp_s, submap.id, k, se3.IDENTITY)
             record.pose(pose, n, n, seen, FrameMethod.WIDE)
         with record.timer.measure("audit of images"):
             self._state.audit.begin(submap, start.views)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from dualslam.core.camera.base import Camera
 from dualslam.core.geometry import se3
-from dualslam.core.noise_model import DAMPING
+from dualslam.core.noise_model import DAMPING, TINY
 from dualslam.core.types import BoolArray, FloatArray, IntArray
 from dualslam.frontends.direct.patches import Patches, Smear
 from dualslam.frontends.direct.warp import HALF, Pyramid, correlate, inside, project_with_jacobians, sample
@@ -39,8 +39,8 @@ class Placed:
 
 def place(patches: Patches, camera: Camera, T_cam_submap: FloatArray, level: int, usable: BoolArray) -> Placed:
     """Project patches into the image by a pose."""
-    R = T_cam_submap[:3, :3]
-    p = patches.xyz @ R.T + T_cam_submap[:3, 3]
+    R = se3.rotation(T_cam_submap)
+    p = patches.xyz @ R.T + se3.translation(T_cam_submap)
     uv, J_point = project_with_jacobians(camera, p)
     axes = 2.0**level * (J_point @ (R @ patches.J))
     zoom2 = np.abs(axes[:, 0, 0] * axes[:, 1, 1] - axes[:, 0, 1] * axes[:, 1, 0]) / 4.0**level
@@ -69,7 +69,7 @@ def align(
         J = B @ placed.J_pose
         H = np.einsum("nia,nij,njb->ab", J, M, J, optimize=True)
         g = np.einsum("nia,ni->a", J, m)
-        scale = np.sqrt(np.diag(H)) + 1e-12
+        scale = np.sqrt(np.diag(H)) + TINY
         xi = -np.linalg.solve(H / np.outer(scale, scale) + DAMPING * np.eye(6), g / scale) / scale
         T = np.asarray(se3.exp(xi) @ T)
         if np.median(np.linalg.norm(J @ xi, axis=1)) < CONVERGED_PX:
@@ -85,7 +85,7 @@ def _normal_parts(
     image = found.reshape(len(found), -1).astype(np.float64)
     template = template - template.mean(axis=1, keepdims=True)
     image = image - image.mean(axis=1, keepdims=True)
-    contrast = max(float((template * image).sum() / max(float((template * template).sum()), 1e-9)), 0.1)
+    contrast = max(float((template * image).sum() / max(float((template * template).sum()), TINY)), 0.1)
     r = image - contrast * template
     s = max(1.4826 * float(np.median(np.abs(r))), NOISE)
     w = (STUDENT + 1) / (STUDENT + (r / s) ** 2) / s**2

@@ -172,8 +172,8 @@ def _starts(
     last: PosedImage, before: Pyramid, levels: Pyramid, camera: Camera, T_predicted: FloatArray
 ) -> list[FloatArray]:
     """Return first poses: the predicted place, turned as whole images say; and the prediction itself."""
-    R_last, centre = last.T_cam_submap[:3, :3], se3.inverse(T_predicted)[:3, 3]
-    found = turns(before, levels, camera, T_predicted[:3, :3] @ R_last.T)
+    R_last, centre = se3.rotation(last.T_cam_submap), se3.translation(se3.inverse(T_predicted))
+    found = turns(before, levels, camera, se3.rotation(T_predicted) @ R_last.T)
     poses = [T_predicted]
     for R_after_before in found:
         R = R_after_before @ R_last

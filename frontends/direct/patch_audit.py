@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from dualslam.core.camera.base import Camera
 from dualslam.core.geometry import se3
 from dualslam.core.geometry.projection import project_points
+from dualslam.core.noise_model import TINY
 from dualslam.core.types import FloatArray, IntArray, View
 from dualslam.frontends.direct.warp import (
     AGREES,
@@ -116,7 +117,7 @@ class PatchAudit:
             ids[is_shared] = landmark_of[patches.feature[is_shared]]
             rows = np.flatnonzero(ids >= 0)
             uv, depth = project_points(K, T_cam_submap, submap.landmarks["xyz_mu"][ids[rows]])
-            zoom = submap.depths(ids[rows], se3.inverse(submap.T_submap_kf[k])) / np.maximum(depth, 1e-9)
+            zoom = submap.depths(ids[rows], se3.inverse(submap.T_submap_kf[k])) / np.maximum(depth, TINY)
             in_view = (depth > 0) & (zoom < MAX_ZOOM) & (zoom > 1 / MAX_ZOOM) & ((uv > 0) & (uv < size_px)).all(axis=1)
             if in_view.sum() >= max(MIN_PATCHES, MIN_IN_VIEW * len(patches.feature)):
                 return k, rows[in_view]

@@ -156,7 +156,7 @@ def patches_of(references: Sequence[PosedImage], camera: Camera) -> Patches | No
         here, right, down = (rays * (np.tile(depth, 3) / rays[:, 2])[:, None]).reshape(3, -1, 3)
         T_submap_cam = se3.inverse(reference.T_cam_submap)
         xyz[mine] = se3.act(T_submap_cam, here)
-        J[mine] = T_submap_cam[:3, :3] @ np.stack([right - here, down - here], axis=2)
+        J[mine] = se3.rotation(T_submap_cam) @ np.stack([right - here, down - here], axis=2)
     return Patches(ids, xyz, J, of, uv, pyramids)
 
 

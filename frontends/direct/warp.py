@@ -16,6 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dualslam.core.camera.base import Camera, plane
+from dualslam.core.geometry import se3
+from dualslam.core.noise_model import TINY
 from dualslam.core.types import BoolArray, FloatArray, IntArray
 
 Pyramid = list[NDArray[np.float32]]
@@ -64,7 +66,7 @@ def warp_points(camera: Camera, uv_px: FloatArray, depth: FloatArray, T_b_a: Flo
     # One call for all: taking a lens out costs more by the call than by the pixel.
     rays = camera.unproject((uv_px + np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])[:, None]).reshape(-1, 2))
     p = rays * (np.tile(depth, 3) / rays[:, 2])[:, None]
-    R, t = T_b_a[..., :3, :3], T_b_a[..., :3, 3]
+    R, t = se3.rotation(T_b_a[...]), se3.translation(T_b_a[...])
     moved = p @ R.T if R.ndim == 2 else np.einsum("nij,snj->sni", R, p.reshape(3, n, 3))
     p_b = (moved + t).reshape(-1, 3)
     here, right, down = camera.project(p_b).reshape(3, n, 2)
@@ -83,7 +85,7 @@ def project_with_jacobians(camera: Camera, p_cam: FloatArray) -> tuple[FloatArra
     here, right, down = camera.project(moved).reshape(3, n, 2)
     by_x, by_y = (right - here) / step, (down - here) / step
     # A pixel depends on the ray alone: it does not change along it.
-    z = np.where(np.abs(p_cam[:, 2:]) > 1e-9, p_cam[:, 2:], np.nan)
+    z = np.where(np.abs(p_cam[:, 2:]) > TINY, p_cam[:, 2:], np.nan)
     by_z = -(p_cam[:, :1] * by_x + p_cam[:, 1:2] * by_y) / z
     return here, np.stack([by_x, by_y, by_z], axis=2)
 
@@ -149,4 +151,4 @@ def correlate(a: NDArray[np.generic], b: NDArray[np.generic]) -> FloatArray:
     x, y = (each.reshape(len(each), math.prod(each.shape[1:])).astype(np.float64) for each in (a, b))
     x, y = x - x.mean(axis=1, keepdims=True), y - y.mean(axis=1, keepdims=True)
     norm = np.sqrt((x * x).sum(axis=1) * (y * y).sum(axis=1))
-    return np.asarray((x * y).sum(axis=1) / np.maximum(norm, 1e-9), np.float64)
+    return np.asarray((x * y).sum(axis=1) / np.maximum(norm, TINY), np.float64)

@@ -90,7 +90,7 @@ class AuxiliaryMap:
 
     def put(self, index: int, reference_id: int, T_cam_submap: FloatArray) -> None:
         """Say where a frame stands, relative to a keyframe of the submap (which may be the frame itself)."""
-        T_submap_kf = self._submap.resolve_anchor(reference_id, np.eye(4))
+        T_submap_kf = self._submap.resolve_anchor(reference_id, se3.IDENTITY)
         self._place[index] = reference_id, se3.inverse(T_submap_kf) @ se3.inverse(T_cam_submap)
 
     def rows_with_track(self, index: int) -> IntArray:

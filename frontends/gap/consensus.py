@@ -120,8 +120,8 @@ def _static_share(
     J = np.column_stack([(distance(xi) - distance(-xi)) / (2 * STEP) for xi in STEP * np.eye(6)])
     of_pose = np.einsum("ni,ij,nj->n", J, within, J)
     agrees = distance(np.zeros(6)) ** 2 < CHI2_95[1] * variance + of_pose
-    points = triangulate_two_view(uv_a, uv_b, K, np.eye(4), se3.inverse(T_b_a))
+    points = triangulate_two_view(uv_a, uv_b, K, se3.IDENTITY, se3.inverse(T_b_a))
     # So far away that an error decides on which side of infinity a point comes to lie, neither side says anything.
-    angle2 = CHI2_95[1] * variance / K[0, 0] ** 2 + np.linalg.eigvalsh(within[:3, :3])[-1]
+    angle2 = CHI2_95[1] * variance / K[0, 0] ** 2 + np.linalg.eigvalsh(se3.rotation(within))[-1]
     far = points.cos_parallax > np.cos(np.minimum(np.sqrt(angle2), np.pi))
     return float((agrees & (far | ((points.depth_a > 0) & (points.depth_b > 0)))).mean())

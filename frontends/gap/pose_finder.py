@@ -280,8 +280,8 @@ class PoseFinder:
         track = judge_track(self._live.track_near(view, found.T_cam_submap), self._config.health)
         if isinstance(track, Failure):
             return None
-        place = se3.inverse(self._map.T_cam_submap(last))[:3, 3]
-        step = float(np.linalg.norm(se3.inverse(track.T_cam_submap)[:3, 3] - place))
+        place = se3.translation(se3.inverse(self._map.T_cam_submap(last)))
+        step = float(np.linalg.norm(se3.translation(se3.inverse(track.T_cam_submap)) - place))
         ids = track.seen_ids
         _, depth = project_points(self._submap.K, track.T_cam_submap, self._submap.landmarks["xyz_mu"][ids])
         if not step < SMALL_STEP * float(np.median(depth)):

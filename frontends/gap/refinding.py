@@ -24,7 +24,7 @@ from dualslam.core.columns import concatenate
 from dualslam.core.geometry import se3
 from dualslam.core.geometry.projection import projection_jacobians, refine_pose
 from dualslam.core.interfaces import Frontend
-from dualslam.core.noise_model import GATE_SIGMAS, MAJORITY
+from dualslam.core.noise_model import GATE_SIGMAS, MAJORITY, TINY
 from dualslam.core.types import BoolArray, Failure, Features, FloatArray, IntArray, Track, View
 from dualslam.frontends.direct.search import HALF_PX, match_patches
 from dualslam.frontends.direct.warp import Pyramid, build_pyramid, warp_points
@@ -175,7 +175,7 @@ class Refinder:
         """Return which landmarks' (N,) depths in keyframe k are known, the poses taken as known."""
         T_kf_submap = se3.inverse(self._submap.T_submap_kf[k])
         along, depth = T_kf_submap[2, :3], self._submap.depths(landmark_ids, T_kf_submap)
-        sigma = np.sqrt(np.einsum("i,nij,j->n", along, covariance, along)) / np.maximum(depth, 1e-12)
+        sigma = np.sqrt(np.einsum("i,nij,j->n", along, covariance, along)) / np.maximum(depth, TINY)
         return np.asarray(sigma < MAX_DEPTH_SIGMA, np.bool_)
 
     def _place_known(

@@ -107,7 +107,7 @@ def _from_two_views(
     uv_v = known.uv_px[shared, v]
     sigma = np.hypot(known.sigma_px[shared, v], sigma_px[shared])
     T_new_v = estimate_relative_pose(uv_v, uv_px[shared], sigma, K, size_px, seed)
-    points = triangulate_two_view(uv_v, uv_px[shared], K, np.eye(4), se3.inverse(T_new_v))
+    points = triangulate_two_view(uv_v, uv_px[shared], K, se3.IDENTITY, se3.inverse(T_new_v))
     usable = (points.depth_a > 0) & (points.depth_b > 0) & np.isfinite(points.xyz).all(axis=1)
     T_others_v = known.T_cam_submap @ se3.inverse(known.T_cam_submap[v])
     seen = known.visible[shared] & usable[:, None]
@@ -115,8 +115,7 @@ def _from_two_views(
     length = _length(points.xyz, known.uv_px[shared], seen, T_others_v, K)
     if length is None:
         return None
-    T_new_v[:3, 3] *= length
-    return np.asarray(T_new_v @ known.T_cam_submap[v], np.float64)
+    return np.asarray(se3.scaled(T_new_v, length) @ known.T_cam_submap[v], np.float64)
 
 
 def _length(xyz: FloatArray, uv_px: FloatArray, seen: BoolArray, T_others_v: FloatArray, K: FloatArray) -> float | None:

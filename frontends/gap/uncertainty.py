@@ -11,7 +11,7 @@ import numpy as np
 
 from dualslam.core.geometry import se3
 from dualslam.core.geometry.projection import projection_jacobians
-from dualslam.core.noise_model import MIN_LANDMARKS
+from dualslam.core.noise_model import MIN_LANDMARKS, TINY
 from dualslam.core.types import Failure, FailureReason, FloatArray, IntArray, Track
 from dualslam.map.landmark_views import landmark_covariances
 from dualslam.map.submap import Submap
@@ -40,11 +40,11 @@ def gap_uncertainty(
     H_pose = (J_pose.swapaxes(1, 2) @ (weight * J_pose)).sum(axis=0)
     H_cross = J_pose.swapaxes(1, 2) @ (weight * J_point)
     inverse = np.linalg.pinv(H_points, hermitian=True)
-    p = xyz @ T_cam_submap[:3, :3].T + T_cam_submap[:3, 3]
+    p = xyz @ se3.rotation(T_cam_submap).T + se3.translation(T_cam_submap)
     g_pose = np.column_stack([p[:, 1], -p[:, 0], np.zeros((n, 3)), np.ones(n)]) / p[:, 2:]
     g_point = T_cam_submap[2, :3] / p[:, 2:]
     # A point counts by how well its own depth is known where the poses are.
-    share = 1.0 / np.maximum(np.einsum("ni,nij,nj->n", g_point, inverse, g_point), 1e-12)
+    share = 1.0 / np.maximum(np.einsum("ni,nij,nj->n", g_point, inverse, g_point), TINY)
     share /= share.sum()
     g_pose_mean, g_point = share @ g_pose, share[:, None] * g_point
     reduced = H_pose - (H_cross @ inverse @ H_cross.swapaxes(1, 2)).sum(axis=0)
@@ -86,7 +86,7 @@ def refuse_lost_scale(submap: Submap, track: Track, last: Track, max_scale_sigma
     A step from the last track that is small against the depth of what is seen leaves the scale where it is.
     """
     ids = track.seen_ids
-    step = se3.inverse(track.T_cam_submap)[:3, 3] - se3.inverse(last.T_cam_submap)[:3, 3]
+    step = se3.translation(se3.inverse(track.T_cam_submap)) - se3.translation(se3.inverse(last.T_cam_submap))
     if np.linalg.norm(step) < SMALL_STEP * np.median(submap.depths(ids, track.T_cam_submap)):
         return None
     known = track_uncertainty(submap, track)

@@ -6,6 +6,7 @@ import numpy as np
 
 from dualslam.core.geometry import se3
 from dualslam.core.geometry.projection import projection_jacobians
+from dualslam.core.noise_model import TINY
 from dualslam.core.types import FloatArray
 
 
@@ -30,7 +31,7 @@ def direction_sigma_deg(
     H_cc = (np.einsum("nki,nkj->nij", J_pose, J_pose) * weight).sum(0)
     try:
         S = H_cc - np.einsum("nij,njk,nlk->il", H_cp, np.linalg.inv(H_pp), H_cp)
-        t_cam = T_b_w[:3, 3]
+        t_cam = se3.translation(T_b_w)
         along = np.zeros(6)
         along[3:] = t_cam / np.linalg.norm(t_cam)
         S += np.outer(along, along) * np.trace(H_cc)
@@ -44,6 +45,6 @@ def direction_sigma_deg(
 
 def direction_angle_deg(T_1: FloatArray, T_2: FloatArray) -> float:
     """Return the angle between the translations of two poses (4, 4), degrees."""
-    t1, t2 = T_1[:3, 3], T_2[:3, 3]
-    cosine = t1 @ t2 / max(float(np.linalg.norm(t1) * np.linalg.norm(t2)), 1e-12)
+    t1, t2 = se3.translation(T_1), se3.translation(T_2)
+    cosine = t1 @ t2 / max(float(np.linalg.norm(t1) * np.linalg.norm(t2)), TINY)
     return float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))

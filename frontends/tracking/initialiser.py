@@ -21,7 +21,7 @@ from dualslam.core.decisions import Gate
 from dualslam.core.geometry import se3
 from dualslam.core.geometry.triangulation import triangulate_two_view
 from dualslam.core.interfaces import START_REACH, Frontend
-from dualslam.core.noise_model import GATE_SIGMAS, PROOF_VIEWS, START_POINTS
+from dualslam.core.noise_model import GATE_SIGMAS, PROOF_VIEWS, START_POINTS, TINY
 from dualslam.core.types import Failure, FailureReason, Features, FloatArray, Matches, Start, View
 from dualslam.frontends.features.motion_statistics import match_by_motion, nearest_search
 from dualslam.frontends.tracking.direction import direction_angle_deg, direction_sigma_deg
@@ -211,12 +211,12 @@ class Initialiser:
     def _direction_sigma_deg(self, pair: ViewPair) -> float:
         """Return how well two views alone know the direction, before any bundle adjustment."""
         sigma_px = pair.b.features.sigma_px[pair.matches.index[pair.good, 1]]
-        return direction_sigma_deg(self._K, np.eye(4), se3.inverse(pair.T_b_a), pair.xyz[pair.good], sigma_px)
+        return direction_sigma_deg(self._K, se3.IDENTITY, se3.inverse(pair.T_b_a), pair.xyz[pair.good], sigma_px)
 
     def _evaluate(self, a: View, b: View, matches: Matches, T_b_a: FloatArray) -> ViewPair:
         fa, fb = matches.index[:, 0], matches.index[:, 1]
         points = triangulate_two_view(
-            a.features.uv_rect_px[fa], b.features.uv_rect_px[fb], self._K, np.eye(4), se3.inverse(T_b_a)
+            a.features.uv_rect_px[fa], b.features.uv_rect_px[fb], self._K, se3.IDENTITY, se3.inverse(T_b_a)
         )
         uv_a, uv_b, sigma_b = a.features.uv_rect_px[fa], b.features.uv_rect_px[fb], b.features.sigma_px[fb]
         fits = (points.error2_a < CHI2_95[2] * a.features.sigma_px[fa] ** 2) & (
@@ -282,8 +282,8 @@ def _contenders(pairs: list[ViewPair], n_matches: int, most: int) -> list[ViewPa
 
 def _turned(uv_a: FloatArray, K: FloatArray, T_b_a: FloatArray) -> FloatArray:
     """Return where pixels of the first view are in the second if they show what is infinitely far."""
-    rays = np.column_stack([uv_a, np.ones(len(uv_a))]) @ (K @ T_b_a[:3, :3] @ np.linalg.inv(K)).T
-    return np.asarray(rays[:, :2] / np.where(np.abs(rays[:, 2:]) > 1e-9, rays[:, 2:], np.nan))
+    rays = np.column_stack([uv_a, np.ones(len(uv_a))]) @ (K @ se3.rotation(T_b_a) @ np.linalg.inv(K)).T
+    return np.asarray(rays[:, :2] / np.where(np.abs(rays[:, 2:]) > TINY, rays[:, 2:], np.nan))
 
 
 def _shift_px(a: View, b: View, matches: Matches) -> float:

@@ -14,7 +14,7 @@ from dualslam.core.decisions import Gate, Ruling
 from dualslam.core.geometry import se3
 from dualslam.core.geometry.projection import MIN_DEPTH
 from dualslam.core.interfaces import Frontend
-from dualslam.core.noise_model import PROOF_VIEWS
+from dualslam.core.noise_model import PROOF_VIEWS, TINY
 from dualslam.core.quantiles import median
 from dualslam.core.types import BoolArray, Features, FloatArray, IntArray, Track
 from dualslam.frontends.tracking.turning import unit_rays
@@ -126,9 +126,9 @@ def parallax_deg(track: Track, submap: Submap, reference_id: int) -> float:
         return 0.0
     T_cam_submap = track.T_cam_submap
     depth = submap.depths(ids, T_cam_submap)
-    centre = se3.inverse(T_cam_submap)[:3, 3]
-    baseline = float(np.linalg.norm(centre - submap.T_submap_kf[reference_id][:3, 3]))
-    return float(np.degrees(np.arctan2(baseline, max(median(depth), 1e-12))))
+    centre = se3.translation(se3.inverse(T_cam_submap))
+    baseline = float(np.linalg.norm(centre - se3.translation(submap.T_submap_kf[reference_id])))
+    return float(np.degrees(np.arctan2(baseline, max(median(depth), TINY))))
 
 
 MIN_SHARE = 0.4
@@ -157,8 +157,8 @@ def passes_unmapped(
     if len(matches) < n:
         return False
     uv_px, uv_kf_px = features.uv_rect_px[rows[matches[:, 0]]], keyframe.uv_rect_px[free[matches[:, 1]]]
-    here = track.T_cam_submap[:3, :3].T @ unit_rays(submap.K, uv_px)
-    there = submap.T_submap_kf[keyframe_id][:3, :3] @ unit_rays(submap.K, uv_kf_px)
+    here = se3.rotation(track.T_cam_submap).T @ unit_rays(submap.K, uv_px)
+    there = se3.rotation(submap.T_submap_kf[keyframe_id]) @ unit_rays(submap.K, uv_kf_px)
     sine = np.linalg.norm(np.cross(here, there, axis=0), axis=0)
     return int((sine > np.sin(np.radians(parallax_deg))).sum()) >= n
 

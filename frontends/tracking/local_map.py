@@ -8,8 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dualslam.core.camera.base import Camera
+from dualslam.core.geometry import se3
 from dualslam.core.geometry.projection import project_points
-from dualslam.core.noise_model import MAJORITY, PROOF_VIEWS
+from dualslam.core.noise_model import MAJORITY, PROOF_VIEWS, TINY
 from dualslam.core.types import BoolArray, FloatArray, IntArray
 from dualslam.frontends.tracking.near_points import nearer_than_proven
 from dualslam.map.submap import Submap
@@ -97,13 +98,13 @@ class LocalMap:
         - `camera`: as it was given: what self-calibration corrects moves the rim of its image by little.
         - `scale_factor`, `n_octaves`: the front end's pyramid.
         """
-        R, t = T_cam_submap[:3, :3], T_cam_submap[:3, 3]
+        R, t = se3.rotation(T_cam_submap), se3.translation(T_cam_submap)
         uv, _ = project_points(K, T_cam_submap, self.xyz_mu)
         rows = np.flatnonzero(camera.shows(uv))  # NaN, behind the camera, is in no image
         to_camera = -R.T @ t - self.xyz_mu.take(rows, axis=0)
         distance = np.sqrt(np.einsum("ij,ij->i", to_camera, to_camera))
-        cosine = np.einsum("ij,ij->i", to_camera, self.normal.take(rows, axis=0)) / np.maximum(distance, 1e-12)
-        scale = self.reference_mu[rows] / np.maximum(distance, 1e-12)
+        cosine = np.einsum("ij,ij->i", to_camera, self.normal.take(rows, axis=0)) / np.maximum(distance, TINY)
+        scale = self.reference_mu[rows] / np.maximum(distance, TINY)
         coarsest = scale_factor ** (n_octaves - 1)
         # One octave beyond the pyramid at either end.
         ok = (cosine > VIEW_COSINE_MIN) & (scale > 1 / scale_factor) & (scale < coarsest * scale_factor)

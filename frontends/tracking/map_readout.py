@@ -20,7 +20,7 @@ from dualslam.core.estimates import ReadoutEstimate
 from dualslam.core.firsts import rank_in_runs
 from dualslam.core.geometry import se3
 from dualslam.core.geometry.projection import project_points, projection_jacobians
-from dualslam.core.noise_model import DAMPING, MIN_DEPTH_MU, PROOF_VIEWS, ROBUST_K
+from dualslam.core.noise_model import DAMPING, MIN_DEPTH_MU, PROOF_VIEWS, ROBUST_K, TINY
 from dualslam.core.robust import huber_weights
 from dualslam.core.types import BoolArray, Failure, FailureReason, FloatArray, IntArray
 from dualslam.map.submap import Submap
@@ -185,6 +185,6 @@ def _inverse_blocks(J_point: Any) -> Any:
     H = (J_point.T @ J_point).tobsr((3, 3))
     blocks = np.zeros((n, 3, 3))
     blocks[np.repeat(np.arange(n), np.diff(H.indptr))] = H.data
-    damping = DAMPING / 3 * np.trace(blocks, axis1=1, axis2=2) + 1e-12
+    damping = DAMPING / 3 * np.trace(blocks, axis1=1, axis2=2) + TINY
     inverse = np.linalg.inv(blocks + damping[:, None, None] * np.eye(3))
     return sparse.bsr_array((inverse, np.arange(n), np.arange(n + 1))).tocsr()

@@ -14,7 +14,7 @@ from dualslam.core.geometry import se3
 from dualslam.core.geometry.triangulation import triangulate_two_view
 from dualslam.core.geometry.two_view import fundamental_from_pose
 from dualslam.core.interfaces import Frontend
-from dualslam.core.noise_model import CELLS_ACROSS, COVISIBLE, PROOF_VIEWS, SAME_POINT_PX
+from dualslam.core.noise_model import CELLS_ACROSS, COVISIBLE, PROOF_VIEWS, SAME_POINT_PX, TINY
 from dualslam.core.quantiles import median
 from dualslam.core.types import BoolArray, Features, FloatArray, IntArray, Keyframe, Track
 from dualslam.frontends.features.matching import FeatureGrid, match_epipolar, match_projected
@@ -214,7 +214,7 @@ class Mapper:
         rows_a = np.flatnonzero((submap.landmark_of[k] == NO_LANDMARK) & candidates)
         rows_b = np.flatnonzero(submap.landmark_of[other] == NO_LANDMARK)
         T_submap_a, T_submap_b = submap.T_submap_kf[k], submap.T_submap_kf[other]
-        baseline = float(np.linalg.norm(T_submap_a[:3, 3] - T_submap_b[:3, 3]))
+        baseline = float(np.linalg.norm(se3.translation(T_submap_a) - se3.translation(T_submap_b)))
         depth = self._median_depth(other)
         if not _wide_enough(depth, baseline, min_parallax_deg) or len(rows_a) == 0 or len(rows_b) == 0:
             return np.zeros(0, np.int64)
@@ -246,7 +246,7 @@ class Mapper:
 
     def _octave_tolerance(self, depth_mu: float, baseline_mu: float) -> int:
         """Octaves between two views of a point: one, and as many as going so far towards the scene brings in scale."""
-        growth = np.log1p(baseline_mu / max(depth_mu, 1e-12)) / np.log(self._frontend.scale_factor)
+        growth = np.log1p(baseline_mu / max(depth_mu, TINY)) / np.log(self._frontend.scale_factor)
         return 1 + int(growth)
 
     def _median_depth(self, k: int) -> float:
@@ -258,7 +258,7 @@ class Mapper:
         self, a: Features, b: Features, fa: IntArray, fb: IntArray, depth_a: FloatArray, depth_b: FloatArray
     ) -> BoolArray:
         """A patch at twice the distance has half the scale, to within 1.5 octaves' ratio."""
-        ratio = (depth_a * a.scale[fa]) / np.maximum(depth_b * b.scale[fb], 1e-12)
+        ratio = (depth_a * a.scale[fa]) / np.maximum(depth_b * b.scale[fb], TINY)
         tolerance = 1.5 * self._frontend.scale_factor
         return (ratio < tolerance) & (ratio > 1 / tolerance)
 
@@ -278,10 +278,10 @@ class Mapper:
         feature = np.flatnonzero(submap.landmark_of[k] >= 0)
         ids = submap.landmark_of[k][feature]
         features = submap.keyframes[k].features
-        to_camera = submap.T_submap_kf[k][:3, 3] - lm["xyz_mu"][ids]
+        to_camera = se3.translation(submap.T_submap_kf[k]) - lm["xyz_mu"][ids]
         distance = np.linalg.norm(to_camera, axis=1)
         lm["descriptor"][ids] = features.descriptors[feature]
-        lm["normal"][ids] = to_camera / np.maximum(distance, 1e-12)[:, None]
+        lm["normal"][ids] = to_camera / np.maximum(distance, TINY)[:, None]
         lm["distance_mu"][ids] = distance
         lm["scale"][ids] = features.scale[feature]
 

@@ -7,9 +7,10 @@ import poselib
 
 from dualslam.core.camera.base import Camera
 from dualslam.core.chi_square import CHI2_95
+from dualslam.core.geometry import se3
 from dualslam.core.geometry.two_view import fundamental_from_pose, sampson_error
 from dualslam.core.interfaces import Frontend
-from dualslam.core.noise_model import GATE_SIGMAS, INFLATION
+from dualslam.core.noise_model import GATE_SIGMAS, INFLATION, TINY
 from dualslam.core.types import Features, FloatArray, View
 from dualslam.frontends.tracking.focal_search import MIN_MATCHES
 from dualslam.frontends.tracking.resection import poselib_camera
@@ -144,8 +145,7 @@ class ReadoutEstimator:
             pose = poselib.estimate_relative_pose(*straight[way[0]], lens, lens, ransac, converged)[0]
             for n in way:
                 pose = poselib.refine_relative_pose(*straight[n], pose, lens, lens, refine)[0]
-                T_b_a = np.eye(4)
-                T_b_a[:3] = pose.Rt
+                T_b_a = se3.from_parts(pose.R, pose.t)
                 error2 = sampson_error(fundamental_from_pose(camera.K, T_b_a), *straight[n]) / sigma_px**2
                 misfits[n] = min(misfits[n], float((CHI2_95[1] * np.log1p(error2 / CHI2_95[1])).sum()))
         return misfits[:-1], float(misfits[-1])
@@ -161,7 +161,7 @@ def _minimum(chi2: FloatArray, best: int) -> float:
     if not 0 < best < len(chi2) - 1:
         return float(READOUTS_S[best])
     left, middle, right = chi2[best - 1 : best + 2]
-    return float(READOUTS_S[best] + 0.5 * STEP_S * (left - right) / max(left - 2 * middle + right, 1e-9))
+    return float(READOUTS_S[best] + 0.5 * STEP_S * (left - right) / max(left - 2 * middle + right, TINY))
 
 
 def _mean(chi2: FloatArray) -> float:

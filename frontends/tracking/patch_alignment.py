@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from dualslam.core.camera.base import Camera
 from dualslam.core.geometry import se3
-from dualslam.core.noise_model import MAJORITY
+from dualslam.core.noise_model import MAJORITY, TINY
 from dualslam.core.types import REFINED_PX, BoolArray, FloatArray, IntArray
 from dualslam.frontends.direct.patches import MIN_CONTRAST
 from dualslam.frontends.direct.warp import (
@@ -145,7 +145,7 @@ class PatchAlignment:
         depths = [submap.depths(ids, se3.inverse(submap.T_submap_kf[k])) for k in kept.tolist()]
         at_kf = np.searchsorted(kept, (kf, kf_there))
         depth, depth_there = np.array(depths).reshape(len(kept), len(ids))[at_kf, column]
-        zoom = depth_there / np.maximum(depth, 1e-9)
+        zoom = depth_there / np.maximum(depth, TINY)
         fits = np.flatnonzero((kf_there != kf) & (zoom < MAX_ZOOM) & (zoom > 1 / MAX_ZOOM))
         is_first = kf_there[fits] == first[landmark[fits]]
         order = fits[np.lexsort((-kf_there[fits], -np.abs(kf_there - kf)[fits], ~is_first, at[fits]))]

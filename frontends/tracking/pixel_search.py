@@ -14,6 +14,7 @@ from dualslam.core.columns import concatenate
 from dualslam.core.errors import FrontendError
 from dualslam.core.geometry import se3
 from dualslam.core.interfaces import Frontend, PixelMatcher
+from dualslam.core.noise_model import TINY
 from dualslam.core.pixels import PixelMatches, PosedImage
 from dualslam.core.quantiles import median
 from dualslam.core.types import Failure, Features, FloatArray, FrameMethod, IntArray, Track, View
@@ -88,7 +89,7 @@ class PixelSearch:
         ids = found.landmark_ids[row]
         of, depth_mu = described.rows(ids)
         depth_new = submap.depths(ids, T_predicted)
-        zoom = np.where(depth_new > 0, depth_mu / np.maximum(depth_new, 1e-9), 1.0)
+        zoom = np.where(depth_new > 0, depth_mu / np.maximum(depth_new, TINY), 1.0)
         kept, features = features_found(
             of,
             found.uv_px[row],

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import poselib
 
+from dualslam.core.geometry import se3
 from dualslam.core.geometry.projection import PoseEstimate, refine_pose
 from dualslam.core.types import BoolArray, Failure, FloatArray
 
@@ -50,9 +51,7 @@ def resect(
         "seed": seed,
     }
     pose, found = poselib.estimate_absolute_pose(uv_px, xyz, camera, options, {})
-    T_cam_w = np.eye(4)
-    T_cam_w[:3] = pose.Rt
-    return Resection(T_cam_w, np.array(found["inliers"], np.bool_))
+    return Resection(se3.from_parts(pose.R, pose.t), np.array(found["inliers"], np.bool_))
 
 
 def estimate_pose(

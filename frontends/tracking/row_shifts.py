@@ -8,6 +8,7 @@ import numpy as np
 
 from dualslam.core.camera.base import Camera
 from dualslam.core.geometry import so3
+from dualslam.core.noise_model import TINY
 from dualslam.core.types import Features, FloatArray
 
 
@@ -29,7 +30,7 @@ def correct_shutter(
 def _turned(rays: FloatArray, share: FloatArray, turn_rad: FloatArray) -> FloatArray:
     """Turn each ray (N, 3) by its share (N,) of a turn (3,), by Rodrigues' formula: N matrices take thrice as long."""
     angle_rad = float(np.linalg.norm(turn_rad))
-    axis = turn_rad / max(angle_rad, 1e-12)
+    axis = turn_rad / max(angle_rad, TINY)
     across = rays @ so3.hat(axis).T
     by = share * angle_rad
     # 1 - cos as a square: small turns keep their digits.

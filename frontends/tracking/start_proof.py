@@ -72,7 +72,7 @@ class StartProof:
         xyz = pair.xyz[good]
         feature = np.full((len(views), len(good)), -1, np.int64)
         feature[0], feature[-1] = pair.matches.index[good, 0], pair.matches.index[good, 1]
-        T_first_cam = np.tile(np.eye(4), (len(views), 1, 1))
+        T_first_cam = np.tile(se3.IDENTITY, (len(views), 1, 1))
         T_first_cam[-1] = se3.inverse(pair.T_b_a)
         support = []
         for v in range(1, len(views) - 1):

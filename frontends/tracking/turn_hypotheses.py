@@ -10,7 +10,8 @@ from __future__ import annotations
 import numpy as np
 
 from dualslam.core.chi_square import CHI2_95
-from dualslam.core.geometry import so3
+from dualslam.core.geometry import se3, so3
+from dualslam.core.noise_model import TINY
 from dualslam.core.types import BoolArray, FloatArray, IntArray
 from dualslam.frontends.tracking.turning import MIN_PIXELS
 
@@ -65,9 +66,7 @@ class TurnHypotheses:
             near = np.flatnonzero(~far)
             t = views.direction_with(R, near, rng) if len(near) >= MIN_PIXELS else None
             if t is not None:
-                T_b_a = np.eye(4)
-                T_b_a[:3, :3], T_b_a[:3, 3] = R, t
-                poses.append(T_b_a)
+                poses.append(se3.from_parts(R, t))
         return poses
 
 
@@ -100,7 +99,7 @@ class _Views:
         # All turns in one product, x, y and z each a block of its own: twice as fast as along strided columns.
         moved = (self._K @ turns).swapaxes(0, 1).reshape(-1, 3) @ np.ascontiguousarray(self._a[rows].T)
         x, y, z = moved.reshape(3, len(turns), len(rows))
-        z = np.where(z > 1e-9, z, np.inf)
+        z = np.where(z > TINY, z, np.inf)
         u, v = self._uv_b[rows].T
         x /= z
         x -= u
@@ -142,5 +141,5 @@ class _Views:
 def _triads(first: FloatArray, second: FloatArray) -> FloatArray:
     """Return (N, 3, 3) right-handed frames of pairs of rays, an axis a column."""
     across = np.cross(first, second)
-    across /= np.maximum(np.linalg.norm(across, axis=1), 1e-12)[:, None]
+    across /= np.maximum(np.linalg.norm(across, axis=1), TINY)[:, None]
     return np.stack([first, across, np.cross(first, across)], axis=2)

@@ -10,12 +10,14 @@ import numpy as np
 import poselib
 
 from dualslam.core.chi_square import CHI2_95, MEDIAN_CHI2
+from dualslam.core.geometry import se3
 from dualslam.core.geometry.two_view import (
     decompose_homography,
     fundamental_from_pose,
     homography_transfer_error,
     sampson_error,
 )
+from dualslam.core.noise_model import TINY
 from dualslam.core.types import FloatArray
 from dualslam.frontends.tracking.resection import poselib_camera
 from dualslam.frontends.tracking.turn_hypotheses import TurnHypotheses
@@ -62,11 +64,9 @@ class RelativePoses:
         poses = []
         for by_turn in self._turns.poses():
             start = poselib.CameraPose()
-            start.R, start.t = by_turn[:3, :3], by_turn[:3, 3]
+            start.R, start.t = se3.rotation(by_turn), se3.translation(by_turn)
             refined, _ = poselib.refine_relative_pose(self._uv_a, self._uv_b, start, camera, camera, refinement)
-            T = np.eye(4)
-            T[:3] = refined.Rt
-            poses.append(_unit_baseline(T))
+            poses.append(_unit_baseline(refined.R, refined.t))
         return poses
 
     def of_essential_matrix(self) -> FloatArray:
@@ -92,7 +92,8 @@ class RelativePoses:
         transfer2 = np.asarray(homography_transfer_error(H_b_a, uv_a, uv_b).mean(axis=1), np.float64)
         flat = transfer2 < CHI2_95[2] * 2.0 * variance * np.clip(noise2, MIN_NOISE2, 1.0)
         share = float((right & flat).sum() / max(int(right.sum()), 1))
-        return [_unit_baseline(T) for T in decompose_homography(H_b_a, self._K).T_b_a] if share > PLANAR_SHARE else []
+        poses = decompose_homography(H_b_a, self._K).T_b_a if share > PLANAR_SHARE else ()
+        return [_unit_baseline(se3.rotation(T), se3.translation(T)) for T in poses]
 
 
 def estimate_relative_pose(
@@ -103,12 +104,8 @@ def estimate_relative_pose(
     gate_px = 2.0 * float(np.median(sigma_px))
     options = {"max_epipolar_error": gate_px, "max_iterations": 1000, "min_iterations": 100, "seed": seed}
     pose, _ = poselib.estimate_relative_pose(uv_a_px, uv_b_px, camera, camera, options, {})
-    T_b_a = np.eye(4)
-    T_b_a[:3] = pose.Rt
-    return _unit_baseline(T_b_a)
+    return _unit_baseline(pose.R, pose.t)
 
 
-def _unit_baseline(T_b_a: FloatArray) -> FloatArray:
-    T = T_b_a.copy()
-    T[:3, 3] /= max(float(np.linalg.norm(T[:3, 3])), 1e-12)
-    return T
+def _unit_baseline(R_b_a: FloatArray, t_b_a: FloatArray) -> FloatArray:
+    return se3.from_parts(R_b_a, t_b_a / max(float(np.linalg.norm(t_b_a)), TINY))

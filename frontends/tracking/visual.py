@@ -213,7 +213,7 @@ class VisualFrontEnd:
         The reference keyframe itself stands where the graph has put it, not where its frame was tracked.
         """
         if track.view.index == self._reference_id:
-            return np.eye(4)
+            return se3.IDENTITY
         return se3.inverse(self.submap.T_submap_kf[self._reference_id]) @ se3.inverse(track.T_cam_submap)
 
     def keyframe_due(self, track: Track) -> Ruling:

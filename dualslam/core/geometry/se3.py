@@ -15,6 +15,9 @@ from numpy.typing import ArrayLike
 from dualslam.core.geometry import so3
 from dualslam.core.types import FloatArray
 
+IDENTITY = np.eye(4)
+IDENTITY.setflags(write=False)
+
 _C3 = [(-1.0) ** k / factorial(2 * k + 3) for k in range(so3.N_TERMS)]
 _C4 = [(-1.0) ** k / factorial(2 * k + 4) for k in range(so3.N_TERMS)]
 _C5 = [(-1.0) ** k * (k + 1) / factorial(2 * k + 5) for k in range(so3.N_TERMS)]
@@ -31,6 +34,23 @@ def from_parts(R: ArrayLike, t: ArrayLike) -> FloatArray:
     T[..., :3, 3] = translation
     T[..., 3, 3] = 1.0
     return T
+
+
+def rotation(T: FloatArray) -> FloatArray:
+    """Return a view of the rotations of poses, (..., 4, 4) -> (..., 3, 3)."""
+    return T[..., :3, :3]
+
+
+def translation(T: FloatArray) -> FloatArray:
+    """Return a view of the translations of poses, (..., 4, 4) -> (..., 3)."""
+    return T[..., :3, 3]
+
+
+def scaled(T: FloatArray, scale: float | FloatArray) -> FloatArray:
+    """Return poses (..., 4, 4) whose translations are so many times as long: in another unit of length."""
+    out = T.copy()
+    out[..., :3, 3] *= scale
+    return out
 
 
 def hat(xi: ArrayLike) -> FloatArray:

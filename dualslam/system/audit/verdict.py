@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from dualslam.core.noise_model import ROBUST_N
+from dualslam.core.noise_model import ROBUST_N, TINY
 from dualslam.core.types import FloatArray
 
 MAX_REASONS = 3
@@ -121,4 +121,4 @@ def measure_steps(times_s: FloatArray, centres: FloatArray) -> Steps:
     window = np.lib.stride_tricks.sliding_window_view(padded, 2 * ROBUST_N + 1)
     about = np.nanmedian(np.delete(window, ROBUST_N, axis=1), axis=1)
     expected = np.maximum(about, LEAST_OF_MEDIAN * float(np.median(speed)))
-    return Steps(speed / np.maximum(expected, 1e-12), length - expected * interval_s)
+    return Steps(speed / np.maximum(expected, TINY), length - expected * interval_s)
