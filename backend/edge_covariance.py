@@ -16,10 +16,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from dualslam.backend.noise import GAUGE_SIGMA
+from dualslam.core.chi_square import huber_weights
 from dualslam.core.errors import SolverError
 from dualslam.core.geometry import se3, so3
 from dualslam.core.noise_model import MIN_DEPTH_MU
-from dualslam.core.robust import huber_weights
 from dualslam.core.types import FloatArray, IntArray
 from dualslam.map.submap import Submap
 

@@ -18,10 +18,10 @@ from scipy.sparse.csgraph import reverse_cuthill_mckee
 
 from dualslam.backend.observability import projection_jacobian, reproject
 from dualslam.backend.point_refinement import normal_equations
+from dualslam.core.arrays import sum_by
 from dualslam.core.bundle import BundleProblem
 from dualslam.core.errors import SolverError
 from dualslam.core.geometry import se3, so3
-from dualslam.core.sums import sum_by
 from dualslam.core.types import FloatArray, IntArray
 
 Loss = Callable[[FloatArray], tuple[FloatArray, FloatArray]]

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from dualslam.backend.observability import take_mask
-from dualslam.core.firsts import rank_in_runs
+from dualslam.core.arrays import rank_in_runs
 from dualslam.core.noise_model import CELLS_ACROSS, PROOF_VIEWS
 from dualslam.core.types import BoolArray, FloatArray, IntArray
 

@@ -31,7 +31,7 @@ from dualslam.core.camera.base import Camera
 from dualslam.core.camera.calibrated_size import PRINCIPAL_POINT_SIGMA
 from dualslam.core.camera.corrected import LensCorrection, correction_of, given_camera
 from dualslam.core.chi_square import CHI2_999
-from dualslam.core.config.calibration_config import CalibrationConfig
+from dualslam.core.config.settings import CalibrationConfig
 from dualslam.core.errors import SolverError
 from dualslam.core.estimates import MAX_PRIOR_SIGMAS, CalibrationEstimate, PreferredCamera
 from dualslam.core.geometry import se3, so3

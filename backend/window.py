@@ -18,11 +18,10 @@ from dualslam.backend.noise import LEAST_NOISE, OUTLIER_CHI2, residual_variance
 from dualslam.backend.observability import projection_jacobian, reproject
 from dualslam.backend.point_refinement import huber, normal_equations
 from dualslam.backend.selection import spread_evenly
+from dualslam.core.arrays import rank_in_runs, sum_by
 from dualslam.core.bundle import BundleProblem
 from dualslam.core.estimates import GraphEstimate
-from dualslam.core.firsts import rank_in_runs
 from dualslam.core.geometry import se3, so3
-from dualslam.core.sums import sum_by
 from dualslam.core.types import Failure, FailureReason, FloatArray, IntArray
 from dualslam.map.submap import Submap
 

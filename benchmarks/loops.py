@@ -23,7 +23,7 @@ from typing import Any
 
 import numpy as np
 
-from dualslam.core.threads import limit_threads
+from dualslam.core.resources import limit_threads
 from dualslam.core.types import FloatArray
 
 FRAMES = {"circuit": 400, "eight": 800, "terrace": 300, "corridors": 470, "posters": 430}

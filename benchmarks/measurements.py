@@ -11,7 +11,7 @@ import argparse
 from dataclasses import replace
 from pathlib import Path
 
-from dualslam.core.threads import limit_threads
+from dualslam.core.resources import limit_threads
 
 limit_threads()
 

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dualslam.core.config.settings import Config
-from dualslam.core.memory import peak_rss_mb
+from dualslam.core.resources import peak_rss_mb
 from dualslam.core.types import Features, Keyframe
 from dualslam.frontends.features.hamming import hamming_distance
 from dualslam.frontends.registry import create_frontend

@@ -24,7 +24,7 @@ from typing import Any
 
 import numpy as np
 
-from dualslam.core.threads import limit_threads
+from dualslam.core.resources import limit_threads
 
 KINDS = ("wrong_pose", "blur", "blackout", "drop", "exposure", "turn")
 SCENES = ("street", "room")

@@ -26,8 +26,7 @@ if TYPE_CHECKING:
     from dualslam.core.config.files import config_from_dict, dump_config, load_config
     from dualslam.core.config.settings import Config
     from dualslam.core.errors import ConfigError, DualSlamError, InputError, OutputError, SolverError
-    from dualslam.core.memory import keep_freed_memory
-    from dualslam.core.threads import limit_threads
+    from dualslam.core.resources import keep_freed_memory, limit_threads
     from dualslam.core.types import Failure, Frame
     from dualslam.io.map_store import load_atlas, save_atlas
     from dualslam.lab.disturbances import corrupted
@@ -75,9 +74,9 @@ _WHERE = {
     "dump_config": "core.config.files",
     "evaluate_run": "lab.metrics.trajectory_metrics",
     "frame_rows": "run.results",
-    "keep_freed_memory": "core.memory",
+    "keep_freed_memory": "core.resources",
     "judge_run": "run.judgement",
-    "limit_threads": "core.threads",
+    "limit_threads": "core.resources",
     "load_atlas": "io.map_store",
     "load_config": "core.config.files",
     "open_source": "run.sources",
@@ -145,7 +144,7 @@ def __getattr__(name: str) -> object:
     if name not in _WHERE:
         raise AttributeError(f"module 'dualslam' has no attribute {name!r}")
     if name == "Slam":  # a program of five lines calls nothing before it
-        import_module("dualslam.core.threads").limit_threads()
+        import_module("dualslam.core.resources").limit_threads()
     value = getattr(import_module(f"dualslam.{_WHERE[name]}"), name)
     globals()[name] = value
     return value

@@ -7,8 +7,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from dualslam.core.camera.base import Camera
-from dualslam.core.camera.rectification import rectify
+from dualslam.core.camera.base import Camera, rectify
 from dualslam.core.grey_image import GreyImage
 from dualslam.core.interfaces import Frontend, Shutter
 from dualslam.core.types import Failure, FailureReason, Frame, LateFrame, View

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dualslam.core.types import BoolArray
-from dualslam.frontends.features.image_noise import ROUNDING_VARIANCE, estimate_noise
+from dualslam.frontends.features.images import ROUNDING_VARIANCE, estimate_noise
 
 U8Image = NDArray[np.uint8]
 F32Image = NDArray[np.float32]

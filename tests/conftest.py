@@ -6,7 +6,7 @@ import signal
 import pytest
 from hypothesis import HealthCheck, settings
 
-from dualslam.core.threads import limit_threads
+from dualslam.core.resources import limit_threads
 
 limit_threads()
 

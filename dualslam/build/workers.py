@@ -12,7 +12,7 @@ from dualslam.core.camera.base import Camera
 from dualslam.core.config.settings import Config, FrontendConfig
 from dualslam.core.interfaces import SubmapGraph
 from dualslam.core.jobs import Handler, Handlers, JobKind
-from dualslam.core.threads import spare_cores
+from dualslam.core.resources import spare_cores
 from dualslam.core.types import Failure, Frame
 from dualslam.core.walk_news import WalkWatch
 from dualslam.frontends.registry import create_frontend

@@ -15,8 +15,7 @@ from dualslam.cli.parser import parse
 from dualslam.cli.streams import lenient, without_libraries
 from dualslam.core import exit_status
 from dualslam.core.errors import ConfigError, DualSlamError, FrontendError, InputError, OutputError
-from dualslam.core.memory import keep_freed_memory
-from dualslam.core.threads import limit_threads
+from dualslam.core.resources import keep_freed_memory, limit_threads
 
 
 def main(argv: Sequence[str] | None = None) -> int:

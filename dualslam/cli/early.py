@@ -1,4 +1,4 @@
-"""Checks before anything heavy is imported: a mistyped field or path is answered at once."""
+"""Checks before any work: a mistyped field or path, or an output in the way, is answered at once."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from dualslam.cli.configuration import config_of
-from dualslam.core.missing import check_exists
+from dualslam.core.errors import OutputError, check_exists
 
 
 def check(args: argparse.Namespace) -> None:
@@ -20,3 +20,15 @@ def check(args: argparse.Namespace) -> None:
         # A number is a webcam; with a colon it is a stream or a synthetic world.
         if ":" not in source and not source.isdigit():
             check_exists(Path(source))
+
+
+def check_free(file: Path, overwrite: bool, instead: str) -> None:
+    """Refuse a file that is there already, unless it may be replaced.
+
+    - `overwrite`: whether `--overwrite` was given.
+    - `instead`: what to name in its place, and by which option: "another with --out".
+
+    Raises `OutputError`.
+    """
+    if file.exists() and not overwrite:
+        raise OutputError(f"{file} is there already; name {instead}, or give --overwrite.")

@@ -12,13 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dualslam.atlas.stored_map import StoredMap
-from dualslam.cli.outputs import check_free
+from dualslam.cli.early import check_free
 from dualslam.cli.view_command import save_recording
 from dualslam.core.errors import DualSlamError, InputError, OutputError
 from dualslam.core.types import FloatArray, IntArray
 from dualslam.io.atomic import write_text
-from dualslam.io.colours import load_pictures
-from dualslam.io.export.colours import keyframe_indices, landmark_colours
+from dualslam.io.colours import keyframe_indices, landmark_colours, load_pictures
 from dualslam.io.export.exported_map import ExportedMap, flatten, read_stored, with_frames
 from dualslam.io.export.formats import FORMATS
 from dualslam.io.export.images import mask_of, undistorted, with_images

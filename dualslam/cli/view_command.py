@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from dualslam.cli.outputs import check_free
+from dualslam.cli.early import check_free
 from dualslam.core.errors import InputError
 from dualslam.core.extras import how_to_install
 from dualslam.io.atomic import write_bytes

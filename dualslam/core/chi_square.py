@@ -39,3 +39,8 @@ def variance_by_median(chi2: FloatArray, n_views: IntArray) -> float:
       which is given back.
     """
     return float(np.median(chi2 / (1 - 1.5 / n_views))) / MEDIAN_CHI2[2]
+
+
+def huber_weights(chi2: FloatArray, gate: float) -> FloatArray:
+    """Return Huber's weights of squared whitened residuals: 1 up to `gate`, the threshold's square, less beyond."""
+    return np.asarray(np.sqrt(gate / np.maximum(chi2, gate)), np.float64)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from pathlib import Path
 
 
 class DualSlamError(Exception):
@@ -52,3 +53,15 @@ class SolverError(DualSlamError):
 def written(path: Iterable[str | int]) -> str:
     """Return the path to a field of the configuration as messages write it: ``recovery.attempts[1].frontend``."""
     return "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in path).removeprefix(".")
+
+
+def check_exists(source: Path) -> None:
+    """Refuse a path at which there is nothing.
+
+    Raises `InputError`.
+    """
+    if not source.exists():
+        raise InputError(
+            f"{source} does not exist; give a sequence folder, a video file, the number of a webcam or the "
+            "address of a stream."
+        )

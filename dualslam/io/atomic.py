@@ -1,7 +1,8 @@
-"""Files that appear whole or not at all: written beside their place under another name, then renamed into it."""
+"""Files that appear whole or not at all, and folders in which one run writes at a time."""
 
 from __future__ import annotations
 
+import fcntl
 import os
 import tempfile
 from collections.abc import Iterator
@@ -52,3 +53,27 @@ def write_text(path: Path, text: str) -> None:
     """Write a text file atomically, UTF-8."""
     # A file's name may hold bytes that the locale does not know: they go back as they came.
     write_bytes(path, text.encode(errors="surrogateescape"))
+
+
+class FolderLock:
+    """Holds a folder until it is released or the process ends, however it ends; there is no file to be left behind.
+
+    Raises `OutputError` if another one holds it.
+    Raises `OSError` if the folder cannot be opened.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._descriptor: int | None = os.open(path, os.O_RDONLY)
+        try:
+            fcntl.flock(self._descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            self.release()
+            raise OutputError(f"{path} is being written to by another run; choose another folder.") from None
+        except OSError:  # some network file systems lock no folders: there two runs are for the user to keep apart
+            self.release()
+
+    def release(self) -> None:
+        """Let go of it; more than once does no harm."""
+        if self._descriptor is not None:
+            os.close(self._descriptor)
+            self._descriptor = None

@@ -11,8 +11,7 @@ import numpy as np
 
 from dualslam.core.camera.base import Camera
 from dualslam.core.camera.models import camera_from_fov
-from dualslam.core.errors import InputError, NoCalibrationError
-from dualslam.core.missing import check_exists
+from dualslam.core.errors import InputError, NoCalibrationError, check_exists
 from dualslam.io import bags, euroc, folder, kitti, tum_mono, tum_rgbd, video
 from dualslam.io.camera_build import make_camera
 from dualslam.io.camera_files import read_camera_file

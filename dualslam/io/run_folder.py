@@ -23,8 +23,7 @@ from dualslam.core.errors import OutputError
 from dualslam.core.events import Event
 from dualslam.core.schedule import SCHEDULE
 from dualslam.core.types import BoolArray
-from dualslam.io.atomic import write_bytes, write_text
-from dualslam.io.folder_lock import FolderLock
+from dualslam.io.atomic import FolderLock, write_bytes, write_text
 from dualslam.io.map_files import METADATA, to_plain
 from dualslam.io.metric_files import METRIC_FILES
 from dualslam.io.trajectory_files import Trajectory, write_kitti, write_tum

@@ -8,8 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from dualslam.core.columns import concatenate
-from dualslam.core.firsts import is_first
+from dualslam.core.arrays import concatenate, is_first
 from dualslam.core.types import BoolArray, Features, FloatArray, IntArray
 from dualslam.map.landmark_views import landmark_covariances, triangulate_landmarks
 from dualslam.map.submap import NO_LANDMARK, Submap

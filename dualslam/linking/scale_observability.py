@@ -19,11 +19,11 @@ import numpy as np
 from scipy import sparse
 from scipy.spatial.distance import cdist
 
+from dualslam.core.arrays import sum_by
 from dualslam.core.geometry import se3
 from dualslam.core.geometry.alignment import COVARIANCE_INFLATION
 from dualslam.core.geometry.projection import project_points, projection_jacobians
 from dualslam.core.noise_model import GROUP
-from dualslam.core.sums import sum_by
 from dualslam.core.types import FloatArray, IntArray
 from dualslam.linking.gates import PIXEL_CHI2
 from dualslam.map.submap import Submap

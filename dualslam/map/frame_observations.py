@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from dualslam.core.firsts import is_first
+from dualslam.core.arrays import is_first
 from dualslam.core.geometry import se3
 from dualslam.core.geometry.projection import settle_pose
 from dualslam.core.types import Failure, Features, FloatArray, IntArray

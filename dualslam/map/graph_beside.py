@@ -24,8 +24,8 @@ from dualslam.core.estimates import GraphEstimate
 from dualslam.core.interfaces import N_WINDOW, SubmapGraph, WindowSolver
 from dualslam.core.jobs import Desk, JobKind
 from dualslam.core.types import Failure, FailureReason, FloatArray, IntArray
-from dualslam.map.late_estimate import apply_late
 from dualslam.map.submap import Submap
+from dualslam.map.submap_change import apply_late
 from dualslam.map.submap_delta import SubmapDelta, SubmapMirror, drop_dead_rows
 
 log = logging.getLogger(__name__)

@@ -14,7 +14,7 @@ import numpy as np
 
 from dualslam.core.camera.base import Camera
 from dualslam.core.camera.corrected import correct, correction_of
-from dualslam.core.config.calibration_config import CalibrationConfig
+from dualslam.core.config.settings import CalibrationConfig
 from dualslam.core.errors import InputError, SolverError
 from dualslam.core.estimates import CalibrationEstimate
 from dualslam.core.interfaces import SelfCalibrator, SubmapAdjuster, SubmapGraph

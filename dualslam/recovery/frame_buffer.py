@@ -24,7 +24,7 @@ from itertools import islice
 
 import numpy as np
 
-from dualslam.core.memory import MB
+from dualslam.core.resources import MB
 from dualslam.core.types import LateFrame, View
 
 SLOW_HZ = 5.0

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from dualslam.core.firsts import is_first
+from dualslam.core.arrays import is_first
 from dualslam.core.geometry import se3, sim3
 from dualslam.core.types import FloatArray, IntArray
 from dualslam.map.anchors import Anchor

@@ -9,8 +9,8 @@ from typing import Any
 from dualslam.core.errors import InputError
 from dualslam.io.run_folder import DECISIONS, EVENTS, FRAMES, FrameRow
 from dualslam.io.run_reading import read_decisions, read_events, read_frames, read_summary
-from dualslam.report.event_words import event_words
 from dualslam.report.markup import number
+from dualslam.report.statuses import event_words
 
 _SENTENCES = {
     "frame": ("The map explains the frame", "The map does not explain the frame"),

@@ -10,15 +10,13 @@ from typing import Any
 from dualslam.core.config.settings import Config
 from dualslam.core.types import FrameStatus
 from dualslam.io.run_folder import EVENTS, MAP_PAGE, MASK
-from dualslam.report.atlas_table import atlas_section
 from dualslam.report.charts import beside_table, latency_histogram, pace_words, stage_table
-from dualslam.report.event_words import event_words
 from dualslam.report.failures import failures_section, stories, verdict
 from dualslam.report.markup import Markup, cards, document, duration, join, number, picture, table, tag
 from dualslam.report.next_steps import camera_words, next_steps
 from dualslam.report.places import places_section
 from dualslam.report.run_data import RunData, read_run
-from dualslam.report.statuses import WITHOUT_POSE, count, seen_again
+from dualslam.report.statuses import WITHOUT_POSE, count, event_words, seen_again
 from dualslam.report.timeline import timeline
 from dualslam.report.top_view import top_view
 from dualslam.report.trust import trust_section
@@ -241,3 +239,33 @@ def _events(run: RunData) -> Markup:
     if len(run.events) > MAX_EVENTS:
         words += f", of which the first {MAX_EVENTS} are here and all in {EVENTS}"
     return tag("details", tag("summary", words), cards(tuple(_EVENT_COLUMNS), rows, _EVENT_COLUMNS))
+
+
+_HEADS = ("frame", "submaps", "factors", "cost before", "cost after", "rejected", "bent by", "moved by")
+
+
+def atlas_section(run: RunData) -> Markup | None:
+    """Return the table, or None where no submap was ever connected with another."""
+    rows = [_row(event) for event in run.events_of("atlas_solved")]
+    if not rows:
+        return None
+    words = (
+        "Each connection between submaps is a factor of one graph, solved when it comes. What is rejected stays in the "
+        "map and is ignored. A submap is bent by the part of a move that is not a change of its place; in its own unit."
+    )
+    return join([tag("p", words), cards(_HEADS, rows)])
+
+
+def _row(event: dict[str, Any]) -> tuple[str, ...]:
+    factors = ", ".join(f"{n} {kind}" for kind, n in event.get("factors", {}).items())
+    rejected = ", ".join(f"{link['connection']} {link['other_submap']}-{link['submap']}" for link in event["rejected"])
+    return (
+        str(event["frame"]),
+        ", ".join(map(str, event["submaps"])),
+        factors,
+        number(event["cost_before"], 3),
+        number(event["cost_after"], 3),
+        rejected or "-",
+        number(event["largest_bend"], 3),
+        number(event["largest_move"], 3),
+    )

@@ -1,4 +1,4 @@
-"""The statuses of frames in words and classes, and runs of equal ones. Never by colour alone: words and shapes too."""
+"""The statuses of frames, and events, in words and classes. Never by colour alone: words and shapes too."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from dualslam.core.types import FrameStatus
+from dualslam.report.markup import number
 
 MEANING: dict[FrameStatus, str] = {
     FrameStatus.TRACKED: "posed by the live front end",
@@ -57,3 +58,19 @@ def seen_again(summary: Mapping[str, Any], relocalisations_more: int = 0) -> lis
 def span(first: int, last: int) -> str:
     """Return ``frame 3`` or ``frames 3 to 9``."""
     return f"frame {first}" if first == last else f"frames {first} to {last}"
+
+
+_WHERE = frozenset({"event", "frame", "timestamp_s", "submap"})
+
+
+def event_words(event: dict[str, Any]) -> str:
+    """Return names and values of what belongs to an event, but for its kind, frame, time and submap."""
+
+    def shown(value: object) -> str:
+        if isinstance(value, list):
+            return "[" + ", ".join(map(shown, value)) + "]"
+        if isinstance(value, dict):
+            return "(" + ", ".join(f"{k} {shown(v)}" for k, v in value.items()) + ")"
+        return number(value, 4) if isinstance(value, float) else str(value)
+
+    return ", ".join(f"{k} {shown(v)}" for k, v in event.items() if k not in _WHERE and v is not None)

@@ -12,8 +12,7 @@ from typing import Any
 from dualslam.core.config.files import config_from_dict
 from dualslam.core.errors import DualSlamError
 from dualslam.core.interfaces import Sequence
-from dualslam.core.memory import keep_freed_memory
-from dualslam.core.threads import limit_threads
+from dualslam.core.resources import keep_freed_memory, limit_threads
 from dualslam.core.types import Failure
 from dualslam.io.atomic import write_text
 from dualslam.io.run_reading import read_frames

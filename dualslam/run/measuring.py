@@ -15,8 +15,8 @@ from dualslam.atlas.atlas import Atlas, Link
 from dualslam.atlas.metric import MetricMap
 from dualslam.atlas.trajectory import FramePose
 from dualslam.build.parts import MetricParts
+from dualslam.core.arrays import concatenate
 from dualslam.core.atlas_problem import AtlasSolver
-from dualslam.core.columns import concatenate
 from dualslam.core.errors import InputError, SolverError
 from dualslam.core.metric_problem import MeasurementSource, MetricSolution, RowSource
 from dualslam.core.trajectory import Trajectory

@@ -16,8 +16,8 @@ from dualslam.core.config.files import load_run_config
 from dualslam.core.config.settings import Config
 from dualslam.core.errors import InputError
 from dualslam.core.events import EventKind
-from dualslam.core.memory import peak_rss_mb
 from dualslam.core.metric_problem import MeasurementSource
+from dualslam.core.resources import peak_rss_mb
 from dualslam.io.export.exported_map import read_stored
 from dualslam.io.run_folder import FRAMES, TRAJECTORIES_MERGED, TRAJECTORY, check_vacant
 from dualslam.io.run_reading import read_frames, read_numbers, read_summary

@@ -19,7 +19,7 @@ from dualslam.core.config.settings import Config
 from dualslam.core.errors import InputError
 from dualslam.core.events import EventKind
 from dualslam.core.geometry import sim3
-from dualslam.core.memory import MB, peak_rss_mb
+from dualslam.core.resources import MB, peak_rss_mb
 from dualslam.core.types import FloatArray
 from dualslam.io.run_folder import FrameRow
 from dualslam.io.trajectory_files import MAX_DT_S, Trajectory, associate

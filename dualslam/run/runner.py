@@ -12,7 +12,7 @@ from typing import Any, Protocol
 
 from dualslam.core.errors import InputError, OutputError
 from dualslam.core.interfaces import Sequence
-from dualslam.core.memory import peak_rss_mb
+from dualslam.core.resources import peak_rss_mb
 from dualslam.core.schedule import Recorded
 from dualslam.core.types import Frame
 from dualslam.map.frame_records import FrameResult

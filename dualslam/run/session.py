@@ -25,11 +25,10 @@ from dualslam.core.errors import InputError, OutputError, SolverError
 from dualslam.core.events import EventKind
 from dualslam.core.interfaces import Sequence
 from dualslam.core.metric_problem import MeasurementSource
+from dualslam.core.resources import spare_cores
 from dualslam.core.schedule import SCHEDULE, Recorded, header_of
-from dualslam.core.threads import spare_cores
 from dualslam.core.types import Frame
-from dualslam.io.colours import Colours, save_colours, save_pictures
-from dualslam.io.export.colours import keyframe_indices, landmark_colours
+from dualslam.io.colours import Colours, keyframe_indices, landmark_colours, save_colours, save_pictures
 from dualslam.io.image_faults import ImageFaults
 from dualslam.io.map_store import load_atlas, save_atlas
 from dualslam.io.masks import hidden_pixels, masked

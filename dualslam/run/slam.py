@@ -16,8 +16,8 @@ from dualslam.core.camera.base import Camera
 from dualslam.core.config.files import load_config
 from dualslam.core.config.settings import Config
 from dualslam.core.errors import InputError
-from dualslam.core.memory import peak_rss_mb
 from dualslam.core.metric_problem import MeasurementSource
+from dualslam.core.resources import peak_rss_mb
 from dualslam.core.trajectory import Trajectory
 from dualslam.core.types import BoolArray, Frame
 from dualslam.io.export.exported_map import ExportedMap, flatten

@@ -13,12 +13,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from dualslam.core.arrays import quantile
 from dualslam.core.chi_square import CHI2_90, CHI2_9999
 from dualslam.core.config.settings import HealthConfig
 from dualslam.core.estimates import KeyframeReport
 from dualslam.core.geometry import se3
 from dualslam.core.noise_model import GATE_SIGMAS, MAJORITY
-from dualslam.core.quantiles import quantile
 from dualslam.core.support import judge_track
 from dualslam.core.types import Failure, FailureReason, FloatArray, Track
 

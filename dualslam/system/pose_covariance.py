@@ -13,11 +13,11 @@ from typing import Self
 import numpy as np
 from scipy.sparse import bsr_array
 
+from dualslam.core.arrays import sum_by
 from dualslam.core.geometry import se3
 from dualslam.core.geometry.projection import projection_jacobians
 from dualslam.core.interfaces import VisualOdometry
 from dualslam.core.noise_model import BASELINE_SIGMA, MIN_LANDMARKS
-from dualslam.core.sums import sum_by
 from dualslam.core.types import FloatArray, IntArray, Track
 from dualslam.map.submap import NO_LANDMARK, Submap
 

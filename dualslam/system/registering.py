@@ -15,8 +15,8 @@ from dualslam.atlas.record import FrameStamp
 from dualslam.atlas.trajectory import FramePose, Path
 from dualslam.core.errors import SolverError
 from dualslam.core.events import EventKind
-from dualslam.core.memory import MB
 from dualslam.core.noise_model import MAX_TRIES, PROOF_VIEWS
+from dualslam.core.resources import MB
 from dualslam.core.types import FailureReason, FrameMethod, FrameStatus, View
 from dualslam.linking.correspondences import landmarks_shown_in
 from dualslam.linking.motion import find_reached

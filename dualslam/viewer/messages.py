@@ -18,8 +18,8 @@ from dualslam.core.types import BoolArray, FloatArray, Frame, FrameStatus, IntAr
 from dualslam.core.walk_news import WalkNews
 from dualslam.map.frame_records import FrameResult
 from dualslam.map.submap import Submap
-from dualslam.report.event_words import event_words
 from dualslam.report.samples import shrunk
+from dualslam.report.statuses import event_words
 
 if TYPE_CHECKING:
     from dualslam.system.system import System

@@ -18,9 +18,8 @@ from numpy.typing import NDArray
 from dualslam.core.errors import InputError
 from dualslam.core.events import EventKind
 from dualslam.core.types import FloatArray, FrameStatus, IntArray
-from dualslam.report.event_words import event_words
 from dualslam.report.run_data import RunData
-from dualslam.report.statuses import MEANING, stretches
+from dualslam.report.statuses import MEANING, event_words, stretches
 from dualslam.viewer.colours import ELSEWHERE, MATCH_COLOUR, STATUS_COLOURS, SUBMAP_COLOURS, TRUTH_COLOUR
 from dualslam.viewer.playback import Appearing, Playback, Space, camera_statuses, play, segments
 

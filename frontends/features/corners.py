@@ -12,7 +12,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
-from dualslam.core.firsts import rank_in_runs
+from dualslam.core.arrays import rank_in_runs
 from dualslam.core.noise_model import GATE_SIGMAS
 from dualslam.core.types import BoolArray, FloatArray, IntArray
 

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from dualslam.core.camera.base import Camera
-from dualslam.core.camera.rectification import rectified_sigma
+from dualslam.core.camera.base import Camera, rectified_sigma
 from dualslam.core.interfaces import Frontend
 from dualslam.core.types import Features, FloatArray, IntArray
 from dualslam.frontends.tracking.row_shifts import straighten

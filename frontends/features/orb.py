@@ -29,8 +29,7 @@ from dualslam.frontends.features.corners import (
 )
 from dualslam.frontends.features.groups import NO_MATCHES, consistent_rotation, mutual, nearest_by_parts
 from dualslam.frontends.features.hamming import hamming_distance, hamming_matrix
-from dualslam.frontends.features.image_noise import estimate_noise, noise_of_levels
-from dualslam.frontends.features.images import to_grey
+from dualslam.frontends.features.images import estimate_noise, noise_of_levels, to_grey
 from dualslam.frontends.registry import OptionedFrontend
 
 PATCH_RADIUS_PX = 15

@@ -12,8 +12,7 @@ from typing import Protocol
 
 import numpy as np
 
-from dualslam.core.camera.base import Camera
-from dualslam.core.camera.rectification import rectify
+from dualslam.core.camera.base import Camera, rectify
 from dualslam.core.chi_square import CHI2_95
 from dualslam.core.geometry import se3
 from dualslam.core.geometry.triangulation import in_front, triangulate_n_view

@@ -19,8 +19,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from dualslam.core.arrays import concatenate
 from dualslam.core.camera.base import Camera
-from dualslam.core.columns import concatenate
 from dualslam.core.geometry import se3
 from dualslam.core.geometry.projection import projection_jacobians, refine_pose
 from dualslam.core.interfaces import Frontend

@@ -18,9 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from dualslam.core.arrays import rank_in_runs
 from dualslam.core.camera.base import Camera
 from dualslam.core.chi_square import CHI2_99, MEDIAN_CHI2
-from dualslam.core.firsts import rank_in_runs
 from dualslam.core.geometry.projection import project_points, refine_pose
 from dualslam.core.interfaces import Frontend
 from dualslam.core.noise_model import MIN_CONSENSUS

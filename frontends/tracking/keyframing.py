@@ -9,13 +9,13 @@ from __future__ import annotations
 
 import numpy as np
 
+from dualslam.core.arrays import median
 from dualslam.core.config.settings import KeyframeConfig
 from dualslam.core.decisions import Gate, Ruling
 from dualslam.core.geometry import se3
 from dualslam.core.geometry.projection import MIN_DEPTH
 from dualslam.core.interfaces import Frontend
 from dualslam.core.noise_model import PROOF_VIEWS, TINY
-from dualslam.core.quantiles import median
 from dualslam.core.types import BoolArray, Features, FloatArray, IntArray, Track
 from dualslam.frontends.tracking.turning import unit_rays
 from dualslam.map.submap import NO_LANDMARK, Submap

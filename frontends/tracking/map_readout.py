@@ -15,13 +15,12 @@ from typing import Any
 import numpy as np
 from scipy import sparse
 
-from dualslam.core.chi_square import MEDIAN_CHI2
+from dualslam.core.arrays import rank_in_runs
+from dualslam.core.chi_square import MEDIAN_CHI2, huber_weights
 from dualslam.core.estimates import ReadoutEstimate
-from dualslam.core.firsts import rank_in_runs
 from dualslam.core.geometry import se3
 from dualslam.core.geometry.projection import project_points, projection_jacobians
 from dualslam.core.noise_model import DAMPING, MIN_DEPTH_MU, PROOF_VIEWS, ROBUST_K, TINY
-from dualslam.core.robust import huber_weights
 from dualslam.core.types import BoolArray, Failure, FailureReason, FloatArray, IntArray
 from dualslam.map.submap import Submap
 

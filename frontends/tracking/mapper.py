@@ -6,16 +6,15 @@ from collections.abc import Set
 
 import numpy as np
 
+from dualslam.core.arrays import median, rank_in_runs
 from dualslam.core.camera.base import Camera
 from dualslam.core.chi_square import CHI2_95
 from dualslam.core.config.settings import MappingConfig
-from dualslam.core.firsts import rank_in_runs
 from dualslam.core.geometry import se3
 from dualslam.core.geometry.triangulation import triangulate_two_view
 from dualslam.core.geometry.two_view import fundamental_from_pose
 from dualslam.core.interfaces import Frontend
 from dualslam.core.noise_model import CELLS_ACROSS, COVISIBLE, PROOF_VIEWS, SAME_POINT_PX, TINY
-from dualslam.core.quantiles import median
 from dualslam.core.types import BoolArray, Features, FloatArray, IntArray, Keyframe, Track
 from dualslam.frontends.features.matching import FeatureGrid, match_epipolar, match_projected
 from dualslam.frontends.tracking.local_map import LocalMap

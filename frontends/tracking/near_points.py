@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from dualslam.core.quantiles import quantile
+from dualslam.core.arrays import quantile
 from dualslam.core.types import BoolArray, FloatArray
 
 NEARER, NEAREST = 0.5, 0.05

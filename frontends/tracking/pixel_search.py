@@ -9,14 +9,13 @@ from typing import cast
 
 import numpy as np
 
+from dualslam.core.arrays import concatenate, median
 from dualslam.core.camera.base import Camera
-from dualslam.core.columns import concatenate
 from dualslam.core.errors import FrontendError
 from dualslam.core.geometry import se3
 from dualslam.core.interfaces import Frontend, PixelMatcher
 from dualslam.core.noise_model import TINY
 from dualslam.core.pixels import PixelMatches, PosedImage
-from dualslam.core.quantiles import median
 from dualslam.core.types import Failure, Features, FloatArray, FrameMethod, IntArray, Track, View
 from dualslam.frontends.features.found_features import features_found
 from dualslam.frontends.tracking.keyframe_images import KeyframeImages

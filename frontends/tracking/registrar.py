@@ -11,10 +11,10 @@ from collections.abc import Callable, Collection, Mapping
 import numpy as np
 from scipy.sparse import csr_array
 
+from dualslam.core.arrays import is_first
 from dualslam.core.camera.base import Camera
 from dualslam.core.chi_square import CHI2_95, CHI2_99, squared_distances
 from dualslam.core.config.settings import Config
-from dualslam.core.firsts import is_first
 from dualslam.core.geometry import se3
 from dualslam.core.geometry.projection import project_points
 from dualslam.core.geometry.triangulation import in_front, triangulate_two_view

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from dualslam.core.arrays import median
 from dualslam.core.geometry import so3
-from dualslam.core.quantiles import median
 from dualslam.core.types import FloatArray
 
 MIN_PIXELS = 20

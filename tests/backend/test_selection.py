@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from dualslam.backend.selection import Candidates, choose_factors, spread_evenly
-from dualslam.core.firsts import rank_in_runs
+from dualslam.core.arrays import rank_in_runs
 
 N_KEYFRAMES, N_LANDMARKS, WIDTH = 30, 800, 640.0
 

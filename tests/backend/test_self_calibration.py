@@ -19,7 +19,7 @@ from dualslam.build import adjust_submap
 from dualslam.core.bundle import BundleProblem
 from dualslam.core.camera.corrected import LensCorrection, correct
 from dualslam.core.camera.models import PinholeCamera
-from dualslam.core.config.calibration_config import CalibrationConfig
+from dualslam.core.config.settings import CalibrationConfig
 from dualslam.core.geometry import so3
 from dualslam.core.geometry.umeyama import umeyama
 from dualslam.core.types import Failure, FailureReason, FloatArray, Keyframe

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from dualslam.core.estimates import FrontendChoice
-from dualslam.core.threads import LIMITS
+from dualslam.core.resources import LIMITS
 from dualslam.lab.synthetic import SyntheticSequence, render_to_folder
 from dualslam.run.sources import make_world
 from tests.cli.fakes import builder

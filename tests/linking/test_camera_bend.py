@@ -13,8 +13,7 @@ import pytest
 from dualslam.backend.self_calibration import find_preferred_camera
 from dualslam.build import adjust_submap
 from dualslam.core.camera.models import PinholeCamera
-from dualslam.core.config.calibration_config import CalibrationConfig
-from dualslam.core.config.settings import LinkingConfig
+from dualslam.core.config.settings import CalibrationConfig, LinkingConfig
 from dualslam.core.estimates import PreferredCamera
 from dualslam.core.geometry import se3, sim3, so3
 from dualslam.core.types import FailureReason, IntArray

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from dualslam.core.grey_image import GreyImage
-from dualslam.core.memory import MB
+from dualslam.core.resources import MB
 from dualslam.core.types import LateFrame, View
 from dualslam.recovery.frame_buffer import FrameBuffer
 from dualslam.testing.point_world import random_features

@@ -10,7 +10,7 @@ import dataclasses
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import import_module
 from pathlib import Path
 from typing import Any, ClassVar, Self
@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from dualslam.core.errors import InputError
-from dualslam.core.types import BoolArray, FloatArray
+from dualslam.core.types import BoolArray, Features, FloatArray
 
 MAX_RECTIFIED_ANGLE_RAD = math.radians(80.0)
 """Rays farther from the axis have no useful place in a pinhole image: `Camera.rectify` makes them NaN."""
@@ -235,3 +235,20 @@ def plane(p_cam: FloatArray) -> FloatArray:
 def lift(xy: FloatArray) -> FloatArray:
     """Return (x, y, 1)."""
     return np.concatenate([xy, np.ones((len(xy), 1))], 1)
+
+
+def rectify(features: Features, camera: Camera, model_sigma_px: float) -> Features:
+    """Move features to the camera's pinhole equivalent; those that it cannot hold are dropped."""
+    uv_rect_px, magnification = camera.rectify(features.uv_px)
+    sigma_px = rectified_sigma(features.sigma_px, magnification, model_sigma_px)
+    rectified = replace(features, uv_rect_px=uv_rect_px, sigma_px=sigma_px)
+    inside = np.isfinite(uv_rect_px).all(axis=1) & np.isfinite(magnification)
+    return rectified if inside.all() else rectified.take(inside)
+
+
+def rectified_sigma(sigma_px: FloatArray, magnification: FloatArray, model_sigma_px: float) -> FloatArray:
+    """Return the noise (N,) of rectified pixels, from that of the raw ones and the camera model's error.
+
+    In steps of an eighth of an octave: the graph shares one noise model among all pixels of one sigma.
+    """
+    return np.asarray(2.0 ** (np.rint(8.0 * np.log2(np.hypot(sigma_px, model_sigma_px) * magnification)) / 8.0))

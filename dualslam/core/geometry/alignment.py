@@ -12,10 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.random import Generator
 
-from dualslam.core.chi_square import CHI2_95, CHI2_99
+from dualslam.core.chi_square import CHI2_95, CHI2_99, huber_weights
 from dualslam.core.geometry import sim3, so3, symmetric3
 from dualslam.core.geometry.umeyama import Alignment, umeyama, umeyama_batch
-from dualslam.core.robust import huber_weights
 from dualslam.core.types import BoolArray, Failure, FailureReason, FloatArray
 
 __all__ = ["Alignment", "Sim3Estimate", "estimate_sim3_robust", "umeyama", "umeyama_batch"]

@@ -13,9 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from dualslam.core.chi_square import CHI2_95
+from dualslam.core.chi_square import CHI2_95, huber_weights
 from dualslam.core.geometry import se3
-from dualslam.core.robust import huber_weights
 from dualslam.core.types import BoolArray, Failure, FailureReason, FloatArray
 
 MIN_DEPTH = 1e-6

@@ -5,13 +5,13 @@ COLMAP counts pixels from the corner of the image: the centre of the first one i
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
 
 from dualslam.core.geometry import se3, so3
 from dualslam.io.atomic import write_text
-from dualslam.io.export.decimals import decimals
 from dualslam.io.export.exported_map import ExportedMap
 
 FOLDER = Path("sparse") / "0"
@@ -78,3 +78,12 @@ def _points(exported: ExportedMap, place: np.ndarray) -> str:
         colour = " ".join(str(c) for c in exported.colour[p].tolist())
         lines.append(f"{p + 1} {decimals(exported.xyz[p])} {colour} {decimals(mean[p : p + 1])} {track}")
     return "\n".join(lines) + "\n"
+
+
+DECIMALS = 15
+"""As many as a number of about 1 has: what is left of a 0 after some turns, such as 4.9e-19, is written as 0."""
+
+
+def decimals(numbers: Iterable[float]) -> str:
+    """Return numbers with a space between them, as short as they read back the same, and never with an exponent."""
+    return " ".join(np.format_float_positional(round(float(x), DECIMALS) + 0.0, trim="-") for x in numbers)

@@ -20,10 +20,9 @@ from dualslam.core.geometry import se3, sim3
 from dualslam.core.interfaces import VisualOdometry
 from dualslam.core.jobs import Desk, JobKind
 from dualslam.core.types import Failure, FailureReason
-from dualslam.map.late_estimate import apply_late
 from dualslam.map.lens import CalibrationAnswer, CalibrationJob, change_camera, rectified_where_possible
 from dualslam.map.submap import Submap
-from dualslam.map.submap_change import change_of_frame
+from dualslam.map.submap_change import apply_late, change_of_frame
 from dualslam.recovery.manager import Recoveries
 from dualslam.system.state import State
 

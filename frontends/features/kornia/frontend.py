@@ -161,7 +161,7 @@ def one_thread() -> Iterator[None]:
     """Run torch in one thread.
 
     The order of a sum, and so its last bit, depends on their number, and our parallelism is processes
-    (`dualslam.core.threads`).
+    (`dualslam.core.resources`).
     """
     threads = torch.get_num_threads()
     torch.set_num_threads(1)

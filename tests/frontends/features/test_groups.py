@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from dualslam.core.firsts import rank_in_runs
+from dualslam.core.arrays import rank_in_runs
 from dualslam.frontends.features.groups import (
     ROWS_AT_ONCE,
     best_per_group,

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from dualslam.frontends.features.image_noise import estimate_noise, noise_of_levels
+from dualslam.frontends.features.images import estimate_noise, noise_of_levels
 from tests.frontends.conftest import textured
 
 

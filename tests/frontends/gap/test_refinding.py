@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from dualslam.core.camera.rectification import rectify
+from dualslam.core.camera.base import rectify
 from dualslam.core.geometry import se3, so3
 from dualslam.core.geometry.projection import project_points
 from dualslam.core.grey_image import GreyImage

@@ -16,16 +16,11 @@ from dualslam.cli import main
 from dualslam.core.errors import InputError
 from dualslam.core.geometry import se3
 from dualslam.core.types import Frame
-from dualslam.io.colours import GREY, load_colours, save_colours
-from dualslam.io.export.bal import write_bal
-from dualslam.io.export.colmap import write_colmap
-from dualslam.io.export.colours import keyframe_indices, landmark_colours
-from dualslam.io.export.decimals import decimals
+from dualslam.io.colours import GREY, keyframe_indices, landmark_colours, load_colours, save_colours
+from dualslam.io.export.colmap import decimals, write_colmap
 from dualslam.io.export.exported_map import ExportedMap, flatten, with_frames
-from dualslam.io.export.g2o import write_g2o
+from dualslam.io.export.formats import write_bal, write_g2o, write_nerfstudio, write_ply
 from dualslam.io.export.images import mask_of, with_images
-from dualslam.io.export.nerfstudio import write_nerfstudio
-from dualslam.io.export.ply import write_ply
 from dualslam.testing.point_world import CAMERA, PointWorld, cloud, hand_held, system_in
 
 

@@ -11,11 +11,9 @@ from dualslam.atlas.propagation import propagate_anchors, propagate_poses
 from dualslam.atlas.trajectory import FramePose
 from dualslam.backend.submap_graph import ISam2SubmapGraph
 from dualslam.build import adjust_submap, build_system
-from dualslam.core.camera.base import Camera
+from dualslam.core.camera.base import Camera, rectify
 from dualslam.core.camera.corrected import LensCorrection, correction_of
-from dualslam.core.camera.rectification import rectify
-from dualslam.core.config.calibration_config import CalibrationConfig
-from dualslam.core.config.settings import Config, GraphConfig
+from dualslam.core.config.settings import CalibrationConfig, Config, GraphConfig
 from dualslam.core.errors import SolverError
 from dualslam.core.estimates import CalibrationEstimate
 from dualslam.core.events import EventKind
