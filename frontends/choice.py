@@ -59,8 +59,8 @@ class Candidate:
 def choose_frontend(frames: Iterable[Frame], corners: Candidate, blobs: Candidate, n_features: int) -> FrontendChoice:
     """Choose between corners and blobs by a sequence's first frames.
 
-    Blobs cost several times the CPU. They are chosen where images show few corners and blobs are the first to start a
-    map. They are chosen as well where steps are so wide that few corners are found again.
+    Blobs cost several times the CPU. They are chosen where images show few corners and blobs start a map first, or
+    where steps are so wide that few corners are found again.
 
     - `frames`: from the first one on; as many are read as the choice needs.
     - `n_features`: corners that are asked for.
@@ -86,10 +86,7 @@ def choose_frontend(frames: Iterable[Frame], corners: Candidate, blobs: Candidat
 
 
 def _wide_steps(images: list[NDArray[np.uint8]], frontend: Frontend) -> str | None:
-    """Return what shows that steps between frames are wide; None where they are not.
-
-    The velocity of an image is the median flow of its matches with the image before.
-    """
+    """Return what shows that steps between frames are wide, by the median flow of matches; None where they are not."""
     flows, shares = [], []
     for before, after in pairwise(map(frontend.extract, images)):
         i, j = frontend.match_wide(before, after).index.T

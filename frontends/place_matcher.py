@@ -15,10 +15,7 @@ from dualslam.map.submap import Submap
 
 
 class FrontendPlaceMatcher:
-    """A front end as the verification of places asks it (`dualslam.core.place_matcher.PlaceMatcher`).
-
-    `camera`: as it was given.
-    """
+    """A front end as the verification of places asks it (`dualslam.core.place_matcher.PlaceMatcher`)."""
 
     def __init__(self, frontend: Frontend, camera: Camera) -> None:
         self._frontend = frontend

@@ -94,8 +94,7 @@ class PixelMatcherFactory(Protocol):
 def create_pixel_matcher(config: PixelsConfig) -> PixelMatcher | None:
     """Build the pixel matcher that the config names, by the same rules as a front end; None where it names none.
 
-    Raises `ConfigError`: the name is unknown, what it points to cannot be imported or is no pixel matcher, or an option
-    is wrong.
+    Raises `ConfigError`: its name is unknown, cannot be imported or is no pixel matcher, or an option is wrong.
     """
     if config.name is None:
         return None
@@ -207,10 +206,7 @@ def _import(name: str, kind: Kind) -> Any:
 
 
 class OptionedFrontend:
-    """A front end that is made of a number of features and its own strict options.
-
-    `n_features`: keypoints per image, at most.
-    """
+    """A front end that is made of a number of features (keypoints per image, at most) and its own strict options."""
 
     name: str
     options_model: ClassVar[type[BaseModel]]  # of its options

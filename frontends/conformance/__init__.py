@@ -30,12 +30,8 @@ CHECKS: tuple[Callable[[Subject], None], ...] = (*features.CHECKS, *matching.CHE
 
 
 def check_frontend(factory: FrontendFactory, options: Mapping[str, Any] | None = None) -> None:
-    """Run all checks.
+    """Run all checks on what an entry point names, built with `options` (`frontend.options`).
 
-    - `factory`: what the entry point names: usually the front end's class.
-    - `options`: `frontend.options` to build it with.
-
-    Raises `NotConforming`: says everything that is wrong, one line for each check; whatever the front end raises is
-    wrong, too.
+    Raises `NotConforming`: one line for each check that fails, or in which the front end raises anything.
     """
     run_checks(CHECKS, Subject(factory, options or {}))

@@ -52,10 +52,7 @@ class _Patches:
 
 
 class PatchAudit:
-    """Keeps small patches of keyframes, and measures how well a frame at its estimated pose agrees with them.
-
-    `camera`: the camera that rectifies the features now.
-    """
+    """Keeps small patches of keyframes, and measures how well a frame at its estimated pose agrees with them."""
 
     def __init__(self, camera: Callable[[], Camera]) -> None:
         self._camera = camera
@@ -81,8 +78,8 @@ class PatchAudit:
     def measure(self, submap: Submap, view: View, T_cam_submap: FloatArray) -> float | None:
         """Return the share of patches that look as predicted; see `PatchCheck.measure`.
 
-        They are those of the oldest keyframe of the last moment that shows enough of the same. A map that follows a
-        moving thing agrees with its newest keyframes, and not with those from before.
+        They are of the oldest recent keyframe that shows enough of the same. A map that follows a moving thing agrees
+        with its newest keyframes only.
         """
         if view.image is None:
             return None

@@ -1,9 +1,8 @@
 """Search for points of one image in another by their patches, without a detector.
 
-A detector finds a third of its points again at twice the distance, and of these half have descriptors that are still
-alike. Where it is known about where a point must appear, and how much larger or smaller, the image itself can be
-compared: a small patch about the point, resampled as the other camera sees it, is moved over the predicted place.
-Both images are taken at the coarser one's resolution.
+A detector finds a third of its points again at twice the distance. Where a point's place and size are predicted, a
+small patch about it is resampled as the other camera sees it, at the coarser image's resolution, and moved over the
+predicted place.
 """
 
 from __future__ import annotations

@@ -32,8 +32,7 @@ def lowest_in_group(group: IntArray, cost: FloatArray, n_groups: int) -> FloatAr
 def best_per_group(group: IntArray, cost: FloatArray, n_groups: int) -> IntArray:
     """Row of the least cost in each group, ascending; ties go to the earlier row, infinite costs are never chosen.
 
-    - `cost` (N,).
-    - `group` (N,): in [0, n_groups).
+    - `cost` (N,); `group` (N,): in [0, n_groups).
 
     Returns (G,) int64: rows, one for each group that has a finite cost.
     """

@@ -23,7 +23,7 @@ def hamming_distance(a: NDArray[np.generic], b: NDArray[np.generic]) -> FloatArr
 def hamming_matrix(a: NDArray[np.generic], b: NDArray[np.generic]) -> NDArray[np.int32]:
     """Differing bits of all pairs of descriptors (N, 8 k) uint8, (M, 8 k) uint8 -> (N, M).
 
-    FAISS takes 0.6 ms for 1,000 by 1,000 of 32 bytes, numpy's own bit count 2.3, OpenCV's brute-force matcher 8.
+    FAISS takes a quarter of numpy's time, and a twelfth of OpenCV's matcher's.
     """
     a, b = np.ascontiguousarray(a), np.ascontiguousarray(b)
     distances = np.empty((len(a), len(b)), np.int32)

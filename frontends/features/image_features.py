@@ -1,8 +1,6 @@
 """Another front end's features of buffered images, each found once, and beforehand where they can be prefetched.
 
-Attempts at a recovery visit the same frames one after the other, and so does a repeated recovery. Finding SIFT features
-anew each time was more than half of the cost without a link. With a link over a gap, half of the cost was waiting for
-features. The next images are known, so their features are found in the background.
+Attempts at a recovery visit the same frames one after the other, and the next images are known.
 """
 
 from __future__ import annotations
@@ -21,11 +19,9 @@ MAX_BYTES = 48 * 2**20
 
 
 class ImageFeatures:
-    """Features of images, as long as somebody holds these, and up to `MAX_BYTES`: then the one goes first that was
-    not used for longest.
+    """Features of images, as long as somebody holds these, and up to `MAX_BYTES`, the least recently used going first.
 
-    `n_threads`: that look at prefetched images; at a gap six to eight are wanted at once, and the walk goes no further
-    without them. With none they are looked at when they are wanted.
+    `n_threads`: that look at prefetched images; with none they are looked at when they are wanted.
     """
 
     def __init__(self, frontend: Frontend, n_threads: int) -> None:

@@ -128,10 +128,7 @@ def match_by_motion(
 
 
 def nearest_search(frontend: Frontend) -> NearestSearch:
-    """Return the front end as one that finds nearest neighbours.
-
-    Raises `ConfigError`: it does not.
-    """
+    """Return the front end as one that finds nearest neighbours; raises `ConfigError` if it does not."""
     if not isinstance(frontend, NearestSearch):
         raise ConfigError(
             f"gms takes a front end with binary descriptors, as orb, which '{frontend.name}' is not; choose ratio",

@@ -77,12 +77,7 @@ class SiftFrontend(OptionedFrontend):
         self.max_distance_strict = self.options.max_distance_strict
 
     def extract(self, image: NDArray[np.uint8]) -> Features:
-        """Detect and describe up to `n_features` extrema, the finest octave first.
-
-        `image` (H, W) or (H, W, 3) RGB uint8: of any size; a flat or a tiny one has no features.
-
-        Raises `InputError`: the array is no such image.
-        """
+        """Detect and describe up to `n_features` extrema, as `Frontend.extract` says, the finest octave first."""
         grey = to_grey(image)
         detector = self._detector()
         found = detector.detect(grey) if min(grey.shape) >= MIN_SIDE_PX else ()

@@ -1,9 +1,8 @@
 """Whether two frames beyond a gap, each posed by itself, confirm each other.
 
-Matches between them agree with their poses or not, within the noise of their pixels and the errors of the poses. An
-error of a pose moves all matches together. Scheffe's bound for six parameters allows for it: a pose's derivative times
-any error within its 99 % ellipsoid. The two poses are taken to be wrong independently, though both hang by the same
-points on the gap's other side: of a right pair rather too little is asked than too much.
+Matches agree with the poses or not, within their pixels' noise and the poses' errors. An error of a pose moves all
+matches together: Scheffe's bound for six parameters (a pose's derivative times any error within its 99 % ellipsoid)
+allows for it. The two poses are taken to be wrong independently.
 """
 
 from __future__ import annotations
@@ -39,11 +38,10 @@ class BeyondGap:
 
 
 def confirmed_share(first: BeyondGap, second: BeyondGap, matches: IntArray, K: FloatArray) -> float:
-    """Return the share of what two frames both see that agrees with their poses.
+    """Return the share of what two frames both see that agrees with their poses, the lesser of two.
 
-    Twice, and the lesser counts. Of the tracks through the gap: how many lie where the points by the first pose are
-    under the second. And of all else, which was never seen before the gap and had no part in the poses: how much lies
-    on its epipolar line and in front of the cameras. Where the scene repeats itself, only that tells.
+    One is of tracks through the gap: points by the first pose, seen under the second. The other is of all else, which
+    had no part in the poses: epipolar lines, in front of the cameras. Where the scene repeats itself, only that tells.
 
     - `K` (3, 3).
     - `matches` (M, 2): rows of their features.

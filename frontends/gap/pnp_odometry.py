@@ -1,13 +1,11 @@
 """Poses by front ends of their own, frame to frame (paper, section III-B); keyframes and landmarks of the live one.
 
 Features of another front end, found in the buffered images, are matched from frame to frame. Their points, triangulated
-from the frames before, give each frame's pose by PnP. Under that pose the live front end looks for the submap's
-landmarks, and what it finds there makes the frame a keyframe like any other: landmarks are reconstructed from live
-features, and the factor graph solves for the pose anew. What other attempts took for the pose plays no part.
+from the frames before, give each frame's pose by PnP. Under it the live front end finds the submap's landmarks, which
+makes the frame a keyframe like any other; the factor graph solves for the pose anew.
 
-Or the live front end tracks by itself as far as it can (`tracks_live`), which is ten times as fast. Only the frames
-where it fails are posed so. Its own features are matched wide first, since they exist already. If these give no
-accepted pose, features of another front end follow. Finding these takes longer than all the rest.
+With `tracks_live` the live front end tracks as far as it can, ten times as fast, and only the frames where it fails are
+posed so. Its own features are matched wide first, since they exist already.
 
 Where the next frame cannot be posed so (blur, black-out, frames that are missing) the odometry crosses the gap
 (`frontends/gap/pose_finder.py`).
@@ -188,7 +186,7 @@ class PnpOdometry:
     def _find(self, view: View) -> Pose | Failure:
         """Have the front ends pose a frame, one after the other until one can.
 
-        What the last of them cannot tell apart beyond a gap none may cross: farther on, the others may not notice.
+        Beyond a gap that the last of them finds ambiguous, the others are not asked: farther on they may not notice.
         """
         found: Pose | Failure = Failure(FailureReason.TOO_FEW_MATCHES)
         if self._finders[-1].doubt is not None:

@@ -64,12 +64,10 @@ class PoseFinder:
 
     - `live`: of the submap.
     - `camera`: as it was given.
-    - `is_short_cut`: there are other features, better ones: what these leave in doubt beyond a gap is for those to
-      decide. Binary descriptors know a thing again only where they see it from about the same side. Past rows of parked
-      cars, each a copy of the one before, the right pose had only 16 to 46 points of 186 to 294. In scenes without
-      repetition no second pose has the required 12 (8 at most).
-    - `notes_rivals`: whether an ambiguous pose beyond a gap is used, and left to the caller to decide. Otherwise it is
-      refused.
+    - `is_short_cut`: there are other, better features, to which is left what these leave in doubt beyond a gap. Binary
+      descriptors know a thing again only from about the same side: past parked cars the right pose had 16 to 46 points
+      of 186 to 294. Without repetition no second pose has the required 12.
+    - `notes_rivals`: whether an ambiguous pose beyond a gap is used, and left to the caller to decide, or refused.
     - `expected` (mapping of int to (4, 4)): ``T_cam_submap`` of frames beyond the gap, where it is known which of
       several like places they show.
     """
@@ -270,12 +268,10 @@ class PoseFinder:
         return [*(keyframes[i] for i in spread.tolist()), *posed[-1:]]
 
     def _small_step(self, view: View, found: GapPose, last: int) -> Track | None:
-        """Let the submap's landmarks decide where the auxiliary front end's matches alone do not, if the camera has
-        hardly moved.
+        """Let the submap's landmarks decide where the auxiliary matches alone do not, if the camera has hardly moved.
 
-        A camera in the hand turns fast and moves little. Few of the auxiliary front end's points have enough parallax
-        to keep the scale, but the landmarks in view have. A step that is small against their depth does not change
-        that. (Across a long one, landmarks of two or three views would carry their errors over as scale.)
+        A hand-held camera turns fast and moves little: few of the matched points have the parallax to keep the scale,
+        which a step that is small against the depth of the landmarks in view does not change.
         """
         track = judge_track(self._live.track_near(view, found.T_cam_submap), self._config.health)
         if isinstance(track, Failure):
@@ -328,10 +324,10 @@ class PoseFinder:
         return wide
 
     def _holds_scale(self, view: View, wide: GapPose) -> bool:
-        """Whether the landmarks that are found again in the image hold the scale where the wide matches leave it open.
+        """Whether the landmarks found again in the image hold the scale where the wide matches leave it open.
 
-        They carry it on beyond the gap. If they are too few, reverse tracking finds no link and is repeated with other
-        features. After the last ones there is no other try.
+        If they are too few, reverse tracking finds no link and is repeated with other features; after the last ones
+        there is no other try.
         """
         if not self._is_short_cut:
             return False

@@ -1,15 +1,12 @@
 """Landmarks of one side of a gap, found again on the other side in the images themselves.
 
-Beyond unusable frames, or after wide matching, the map's scale depends on landmarks that are seen on both sides. The
-detector finds few of the same points at half or twice the distance. The pose is now known roughly, and so are each
-landmark's place and size. The keyframes beyond the gap are searched for the landmarks of the last keyframes before it,
-by their image patches. Each find becomes a feature like any other.
+The map's scale beyond unusable frames, or after wide matching, depends on landmarks seen on both sides, of which the
+detector finds few at half or twice the distance. With the pose roughly known, the keyframes beyond the gap are searched
+for the landmarks of the last keyframes before it, by their image patches. Each find becomes a feature like any other.
 
 The pose of a gap relocalisation comes from few matches over a long way. There a landmark is looked for once its place
-is known to within what is searched, by the pose's covariance and its own: in a smaller search than that, what looks
-alike and confirms a wrong pose is all there is to find. Landmarks far away come first; what they tell of the pose makes
-way for those nearby (active search: Davison, ICCV 2003). The pose of a tracked frame is by the landmarks that it
-follows, and within the search.
+is known to within the search, by the pose's covariance and its own. Landmarks far away come first; what they tell of
+the pose makes way for those nearby (active search: Davison, ICCV 2003).
 """
 
 from __future__ import annotations

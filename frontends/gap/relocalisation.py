@@ -1,15 +1,12 @@
 """The pose of a frame beyond a gap, from wide matches with several frames whose poses are known.
 
 Two ways lead to a first pose. If the known frames have enough parallax, a 3-point solver uses their points. Otherwise
-the essential matrix between the gap's two sides gives the direction. Each track that a second known frame sees gives
-the length. That helps a map that has just begun: it knows depths to a tenth, and beyond a gap the camera sees things at
-half the distance. Both poses are then refined with the points, the known poses held. The one with more agreeing tracks
-stays.
+the essential matrix between the gap's two sides gives the direction, and each track that a second known frame sees
+gives the length: that helps a map that has just begun. Both poses are refined with the points, the known poses held.
+The one with more agreeing tracks stays.
 
-The refinement uses tracks seen in at least two known frames, if enough exist. A track seen in one may lie anywhere on a
-line. A few such false matches on a road can bend a pose by a degree until they agree with it, unnoticed.
-
-See `gap_uncertainty` for the uncertainty of the translation.
+The refinement uses tracks seen in at least two known frames, if enough exist: a track seen in one may lie anywhere on a
+line, and a few false ones can bend a pose by a degree unnoticed. See `gap_uncertainty` for the uncertainty.
 """
 
 from __future__ import annotations

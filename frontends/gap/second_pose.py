@@ -1,12 +1,11 @@
 """Test for a second pose beyond a gap that explains nearly as much as the first: then the scene repeats itself.
 
-A ratio test keeps a match only if the best candidate is clearly better than the second. That removes just those that
-would show a repetition. A wrong pose, one period off, may have all of the few that are left. So every point is paired
-with all similar features. The pairs that the first pose explains are removed, and the rest is searched for another
-pose. (The same test for two maps: `dualslam/places/sides.py`.)
+A ratio test removes just the matches that would show a repetition. So every point is paired with all similar features,
+the pairs that the first pose explains are removed, and the rest is searched for another pose. (The same test for two
+maps: `dualslam/places/sides.py`.)
 
-What a pose explains is counted among the points that it has in view. A pose near the last one before the gap has nearly
-all of them in view. By number alone it would win over that of a camera that has moved on by a period.
+What a pose explains is counted among the points that it has in view: by number alone a pose near the last one before
+the gap, which has nearly all in view, would win.
 """
 
 from __future__ import annotations
@@ -179,8 +178,7 @@ def _shifted(
 ) -> Iterator[FloatArray]:
     """Yield poses beside the first one that many pairs ask for: what is moved by a period seldom turns as well.
 
-    A camera that has moved sideways by d sees a point at depth z moved by ``- f d / z``: each pair votes for one d, and
-    where the votes are densest there is a pose to be tried.
+    A camera that has moved sideways by d sees a point at depth z moved by ``- f d / z``: each pair votes for one d.
     """
     uv, depth = project_points(K, T_cam_w, xyz)
     seen = depth > 0
@@ -202,10 +200,7 @@ def _shifted(
 
 
 def match_under(sight: Sight, T_cam_w: FloatArray) -> Matches:
-    """Match what is known with what looks like it and lies where a pose shows it.
-
-    Of what repeats itself the copy that the pose has in view is not the one that looks most alike.
-    """
+    """Match what is known with the copy that lies where a pose shows it, which need not look most alike."""
     distance = all_distances(sight.frontend, sight.descriptors, sight.features.descriptors)
     i, j = np.nonzero(distance <= sight.frontend.max_distance_strict)
     near = sight.explained(T_cam_w, i, j, SAME_PX)

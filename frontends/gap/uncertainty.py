@@ -1,8 +1,7 @@
 """Uncertainty of a pose found across a gap: its covariance, and how well it holds the scale.
 
-A frame beyond a gap sees points whose depths are known from the other side, to some extent. All that is mapped beyond
-the gap inherits the scale at which it sees them. What that is worth is not read from residuals, but from the Hessian:
-pose and points are unknown together, the points as well as what is known of them allows.
+All that is mapped beyond the gap inherits the scale at which a frame there sees points of the other side. What that is
+worth is read from the Hessian, in which pose and points are unknown together.
 """
 
 from __future__ import annotations

@@ -69,12 +69,7 @@ class KorniaFrontend(OptionedFrontend):
         return type(self), (self.n_features, self.options)
 
     def extract(self, image: NDArray[np.uint8]) -> Features:
-        """Detect and describe up to `n_features` keypoints.
-
-        `image` (H, W) or (H, W, 3) RGB uint8: of any size; a flat or a tiny one has no features.
-
-        Raises `InputError`: the array is no such image.
-        """
+        """Detect and describe up to `n_features` keypoints, as `Frontend.extract` says."""
         grey = to_grey(image)
         # A flat image, too, has a best keypoint, for a network that keeps the best ones whatever they are.
         if min(grey.shape) < MIN_SIDE_PX or grey.min() == grey.max():
@@ -148,8 +143,7 @@ def choose_device(name: str) -> torch.device:
 def inference(device: torch.device) -> Iterator[None]:
     """Run torch without gradients, and so that the same input gives the same output, bit for bit.
 
-    What that takes belongs to the process, and is put back. Callers in other threads wait: they would put back each
-    other's.
+    The switches belong to the process, and are put back; callers in other threads wait meanwhile.
     """
     exact = one_thread() if device.type == "cpu" else deterministic_cuda()
     with _ONE_CALLER, torch.inference_mode(), exact:
@@ -158,11 +152,7 @@ def inference(device: torch.device) -> Iterator[None]:
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """Run torch in one thread.
-
-    The order of a sum, and so its last bit, depends on their number, and our parallelism is processes
-    (`dualslam.core.resources`).
-    """
+    """Run torch in one thread: the order of a sum, and so its last bit, depends on their number."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
@@ -175,8 +165,7 @@ def one_thread() -> Iterator[None]:
 def deterministic_cuda() -> Iterator[None]:
     """Run torch on a CUDA device with sums in a fixed order, and in the precision of the CPU.
 
-    The histograms of an orientation and of SIFT are atomic additions otherwise, whose order changes. torch warns where
-    an operation has no such form.
+    torch warns where an operation has no such form.
     """
     before, warns = torch.are_deterministic_algorithms_enabled(), torch.is_deterministic_algorithms_warn_only_enabled()
     torch.use_deterministic_algorithms(True, warn_only=True)
@@ -212,10 +201,7 @@ class Detections:
 
 
 class LevelFeatures:
-    """Detector, orientation and descriptor of `dog` and `harris`.
-
-    `n_features`: keypoints per image, at most.
-    """
+    """Detector, orientation and descriptor of `dog` and `harris`."""
 
     def __init__(self, options: KorniaOptions, n_features: int, device: torch.device) -> None:
         self._is_harris = options.detector == "harris"
@@ -279,8 +265,8 @@ class LevelFeatures:
 def _between_pixels(peak: torch.Tensor, response: torch.Tensor) -> tuple[FloatArray, BoolArray, FloatArray]:
     """Fit a parabola to the 3 x 3 neighbourhood of each peak (H, W) of a level; none of them is at the edge.
 
-    Returns the maxima (N, 2), row by row, whether the parabola has one within 0.75 px, and the response at the pixel.
-    Without one, the maximum is the pixel.
+    Returns the maxima (N, 2), row by row, or the pixel where the parabola has none within 0.75 px; whether it has one;
+    and the response at the pixel.
     """
     v, u = torch.nonzero(peak, as_tuple=True)
     step = torch.arange(-1, 2, device=peak.device)

@@ -36,8 +36,8 @@ class Checkpoint:
 
         None: the one in torch's cache, or else the one that the extra's package of weights brings.
 
-        Raises `ConfigError`: it is not there: the message says where it was sought and where it is published. `option`
-        names it.
+        Raises `ConfigError` if it is not there; the message names `option`, where it was sought and where it is
+        published.
         """
         folder = Path(torch.hub.get_dir()) / "checkpoints" if path is None else path
         file = folder / self.file if path is None or path.is_dir() else path
@@ -64,7 +64,7 @@ class Checkpoint:
         """Find the file and put it into a module, which is then ready to be used.
 
         - `option`, `path`: see `find`.
-        - `rename`: old starts of the names of the state to new ones, where the publisher called them otherwise.
+        - `rename`: old starts of the names of the state to new ones.
 
         Raises `ConfigError`: it is not there, cannot be read, or does not fit.
         """
@@ -128,11 +128,7 @@ OPTION = "weights"
 
 
 class Network:
-    """One of the networks.
-
-    - `n_candidates`: keypoints per image, at most.
-    - `weights`: see `KorniaOptions`.
-    """
+    """One of the networks; `n_candidates`: keypoints per image, at most."""
 
     def __init__(self, name: str, n_candidates: int, device: torch.device, weights: Path | None) -> None:
         self._name = name
