@@ -1,10 +1,10 @@
 """The atlas graph: which connections to believe, and the similarities that agree best with those.
 
-Graduated non-convexity (`gtsam.GncLMOptimizer`) starts from the least-squares solution. A false connection with a tiny
-sigma has bent that to itself. Its own residual is small and those of the true ones are large: taken at its word, it
-wins. The decision therefore uses the innovation: how far a connection lies from the result of *all others*, against its
-own covariance and theirs together. A tiny sigma of its own then counts for nothing. A true loop after much drift is not
-refused for being far from a chain with a large known drift. The solution itself uses each connection's own covariance.
+Graduated non-convexity (`gtsam.GncLMOptimizer`) starts from the least-squares solution, which a false connection with a
+tiny sigma has bent to itself: taken at its word, it wins. The decision therefore uses the innovation: how far a
+connection lies from the result of *all others*, against its own covariance and theirs together. A tiny sigma then
+counts for nothing, and a true loop after much known drift is not refused. The solution itself uses each connection's
+own covariance.
 """
 
 from __future__ import annotations
@@ -143,12 +143,11 @@ class _Graph:
     def take_in_drift(self, doubtful: BoolArray) -> tuple[float, FloatArray]:
         """Inflate what submaps say of themselves by what sure connections show of it.
 
-        Returns the ratio of sigmas, and the chi-square of those that were asked against all others (NaN: the rest).
+        Where a connection that is beyond doubt closes a cycle, the way round has drifted by its innovation: with a lens
+        that is not quite right, errors add up as no covariance of pixels says. The lower median of such connections is
+        taken, so that a wrong one among them does not make everything seem possible.
 
-        Where a connection that is beyond doubt closes a cycle, the way round has drifted by its innovation. The chain
-        that contradicts it was surer of itself than it had a right to be, there and elsewhere: with a lens that is not
-        quite right errors add up as no covariance of pixels says. The lower median of such connections is taken, so
-        that a wrong one among them does not make everything seem possible.
+        Returns the ratio of sigmas, and the chi-square of those that were asked against all others (NaN: the rest).
         """
         odometry = np.array([e.kind in ODOMETRY for e in self.problem.edges], bool)
         sure = ~odometry & ~doubtful
@@ -196,11 +195,7 @@ class _Graph:
         return _Choice(believed, chi2, cost + 0.5 * REJECTION_CHI2 * np.count_nonzero(~believed))
 
     def _accused(self, believed: BoolArray, doubtful: BoolArray) -> list[int]:
-        """Return the believed edges that two rejected ones or more would do without: one of them may be the wrong one.
-
-        What came first connects the map and is believed; where what comes later contradicts it more than once, that
-        is tried the other way round.
-        """
+        """Return the believed edges that two or more rejected ones would do without: one of them may be wrong."""
         rejected = np.flatnonzero(~believed).tolist()
         found = []
         for i in np.flatnonzero(believed & doubtful).tolist() if len(rejected) > 1 else ():

@@ -1,12 +1,10 @@
 """How well a submap's own factors know the similarity between two of its keyframes, without opening its graph.
 
-The graph of an archived submap is gone, and iSAM2 tells marginals of single poses against the gauge only: neither gives
-the covariance of a relative pose, and none has a scale, which drifts from keyframe to keyframe where no loop holds it.
-Made anew and asked for joint marginals, the graph of 150 keyframes would take seconds. Therefore the same projection
-factors are linearised here at the values in the arrays, for the keyframes between the two and a few beside them. Their
-landmarks are eliminated (Schur complement), and pose and unit of length of the first keyframe are held. What is left is
-the covariance of the second keyframe's pose and unit. The unit at a keyframe is the mean logarithm of the depths of
-what it sees.
+The graph of an archived submap is gone, and iSAM2 tells marginals of single poses against the gauge only, without a
+scale. Therefore the same projection factors are linearised here at the values in the arrays, for the keyframes between
+the two and a few beside them. Their landmarks are eliminated (Schur complement), and pose and unit of length of the
+first keyframe are held. What is left is the covariance of the second keyframe's pose and unit. The unit at a keyframe
+is the mean logarithm of the depths of what it sees.
 """
 
 from __future__ import annotations

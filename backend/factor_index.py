@@ -206,8 +206,7 @@ class FactorIndex:
     def _factors_per_keyframe(self, submap: Submap, admitted: BoolArray, keyframes: IntArray) -> int:
         """Return how many factors a keyframe may have: fewer, the more keyframes see what the newest ones see.
 
-        They are what an update takes apart: on a road a dozen, in a room that is looked at again and again most of the
-        map. An answer holds until another is half of it or less.
+        They are what an update takes apart. An answer holds until another is half of it or less.
         """
         config, obs = self._config, submap.observations
         if len(keyframes) <= SMALL_MAP:

@@ -1,12 +1,11 @@
 """The last word on a submap: all that it has observed, in batch, under a loss that forgets what does not fit.
 
 The graph used by tracking has a part of the observations and Huber's loss, under which an outlier always pulls with the
-same force. A loss that forgets leads astray while a map is made; from a map that is right already it leads closer: on
-rendered streets by a fifth, on a road by a tenth to two fifths (six seeds, three others). Hand-held maps do not change
+same force. A loss that forgets leads astray while a map is made; from a map that is right already it leads closer
 (docs/notes/2026-11-27-a-last-batch-over-all-observations.md).
 
 The landmarks with most views go first. A false match with few views, right before the camera, bends a pose until it
-agrees: that is an optimum, too (docs/notes/2026-11-28-few-false-near-points-hold-a-wrong-pose.md).
+agrees (docs/notes/2026-11-28-few-false-near-points-hold-a-wrong-pose.md).
 """
 
 from __future__ import annotations
@@ -88,10 +87,7 @@ def _seen(submap: Submap) -> IntArray:
 
 
 def _best_seen(submap: Submap) -> IntArray:
-    """Return the landmarks with as many views as the median of their keyframe, in half of the keyframes that see them.
-
-    Their number of views is relative: on a road all have few.
-    """
+    """Return the landmarks with as many views as their keyframe's median, in half of the keyframes that see them."""
     n_views = submap.n_observations(np.arange(len(submap.landmarks)))
     n_leads = np.zeros(len(n_views), np.int64)
     for seen in submap.landmark_of.values():

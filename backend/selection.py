@@ -1,9 +1,8 @@
 """Which of the observations that a graph could bear become its factors: pure numpy, no solver.
 
 An update's cost is that of the cliques which iSAM2 takes apart and puts together again, each landmark one of them. A
-hand-held map has an order of magnitude more observations than its poses need. A part of them is chosen, spread over the
-images, long tracks first. What is left out stays in the submap, follows the poses (`dualslam.backend.point_refinement`)
-and is tested for outliers like all others.
+part of the observations is chosen, spread over the images, long tracks first. What is left out stays in the submap,
+follows the poses (`dualslam.backend.point_refinement`) and is tested for outliers like all others.
 """
 
 from __future__ import annotations

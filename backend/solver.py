@@ -1,12 +1,9 @@
 """iSAM2 and batch Levenberg-Marquardt behind calls that raise one kind of failure and never hand on a dead solver.
 
-The settings were measured on a corridor (`docs/notes/2026-11-28-isam2-newest-poses-last.md`).
-
-By default iSAM2 eliminates last whatever the new factors touch: here the 250 landmarks in view, so that its root is a
-dense block of some 800 columns. Naming the newest poses instead leaves the landmarks to go first, each a clique of its
-own. The price is that ``enablePartialRelinearizationCheck``, which walks down from the root and stops at the first
-clique that stands still, no longer reaches them: new landmarks kept the linearisation of their triangulation and the
-newest pose suffered. All variables are therefore checked, but not each time.
+By default iSAM2 eliminates last whatever the new factors touch: the landmarks in view, so that its root is a dense
+block of some 800 columns. Naming the newest poses instead leaves the landmarks to go first, each a clique of its own.
+``enablePartialRelinearizationCheck``, which stops at the first clique that stands still, no longer reaches them. All
+variables are therefore checked, but not each time (docs/notes/2026-11-28-isam2-newest-poses-last.md).
 """
 
 from __future__ import annotations

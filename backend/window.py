@@ -1,9 +1,8 @@
 """A small bundle that poses a new keyframe: numpy, Schur complement, a few milliseconds, and no state.
 
 It is the first of two levels of solving: tracking and mapping continue from it at once. The second level, the submap's
-iSAM2 (`dualslam.backend.submap_graph`), takes in the changes since its last update later, several keyframes at once if
-need be. Free are the newest keyframes and the points that the newest of all sees; other keyframes that see these points
-hold them in place.
+iSAM2 (`dualslam.backend.submap_graph`), takes in the changes later. Free are the newest keyframes and the points that
+the newest of all sees; other keyframes that see these points hold them in place.
 """
 
 from __future__ import annotations
@@ -46,10 +45,7 @@ class _State:
 
 
 class NumpyWindowSolver:
-    """The `dualslam.core.interfaces.WindowSolver` in numpy.
-
-    - `robust_k`: Huber threshold in sigmas.
-    """
+    """The `dualslam.core.interfaces.WindowSolver` in numpy; `robust_k`: Huber threshold in sigmas."""
 
     def __init__(self, robust_k: float) -> None:
         self._robust_k = robust_k

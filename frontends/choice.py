@@ -59,8 +59,8 @@ class Candidate:
 def choose_frontend(frames: Iterable[Frame], corners: Candidate, blobs: Candidate, n_features: int) -> FrontendChoice:
     """Choose between corners and blobs by a sequence's first frames.
 
-    Blobs cost several times the CPU. They are chosen where images show few corners and blobs start a map first, or
-    where steps are so wide that few corners are found again.
+    Blobs cost several times the CPU. They are chosen where images show few corners and blobs start a map first. So they
+    are where steps are so wide that few corners are found again.
 
     - `frames`: from the first one on; as many are read as the choice needs.
     - `n_features`: corners that are asked for.

@@ -1,10 +1,9 @@
 """Pixels that stand still in the image while the rest moves: a bonnet, a cab, black bars, a logo, dirt on the lens.
 
 Pairs of images some tenths of a second apart say of each pixel whether its surroundings have stayed. Let lambda be the
-smaller eigenvalue of their structure tensor. A movement by r pixels then changes them by lambda r^2 at least, in the
-mean square and beside the noise. They stay where the change is below that of a movement by `STILL_PX`. They move where
-it is above all that `MOVED_PX` can make. Untextured surroundings say nothing. Distant scenery does not stand still in
-this sense: a camera that is carried turns by more.
+smaller eigenvalue of their structure tensor. A movement by r pixels changes them by lambda r^2 at least, in the mean
+square and beside the noise. They stay where the change is below that of `STILL_PX`, and move where it is above all that
+`MOVED_PX` can make. Untextured surroundings say nothing.
 
 Each pixel collects its votes, of pairs in which part of the image moves. Bars are black and untextured: they are found
 as bands along a side, or as corners, that stay black.

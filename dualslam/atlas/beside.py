@@ -2,9 +2,9 @@
 
 The request is the problem of a linked set (arrays, a megabyte at 600 nodes); the result is where its nodes stand. The
 moves that follow act on the submaps from the left, place by place: what their graphs have found meanwhile is kept, and
-what has come since goes with the place that it came next to. A solution is void, and requested again, if its problem is
-outdated. That is so if something other than its graph changed a submap (a camera, reverse tracking, another solution),
-or if a node is gone. It is also so if two nodes moved so far against each other that their covariance no longer holds.
+what has come since goes with the place that it came next to. A solution is void, and requested again, if something
+other than its graph changed a submap, or a node is gone. It is also void if two nodes moved so far against each other
+that their covariance no longer holds.
 """
 
 from __future__ import annotations

@@ -270,10 +270,7 @@ class Connections:
         return report
 
     def _join(self, link: Link) -> list[int]:
-        """Join two sets by the only connection between them, and return the second, which moves into the first's world.
-
-        Where it has cycles, it is composed along its connections until the next solution.
-        """
+        """Join two sets by the only connection between them; return the second, which moves into the first's world."""
         atlas = self._atlas
         second = max(component for component in atlas.components() if link.a in component or link.b in component)
         for m in second:

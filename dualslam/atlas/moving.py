@@ -149,9 +149,8 @@ class Move:
 def bend_submap(submap: Submap, warp: Warp) -> None:
     """Move everything that a submap holds.
 
-    Each keyframe goes by the similarity at its frame; what that says about scale goes into the points around it, since
-    a pose has none. Landmarks go with the keyframe that described them first, so that what a keyframe sees of its own
-    keeps its pixels.
+    Each keyframe goes by the similarity at its frame, whose scale goes into the points around it. Landmarks go with the
+    keyframe that described them first, so that what a keyframe sees of its own keeps its pixels.
     """
     keyframe_ids, culled = list(submap.keyframes), list(submap.anchors)
     T_culled = [submap.resolve_anchor(a.keyframe_id, a.T_kf_cam) for a in submap.anchors.values()]
@@ -201,8 +200,8 @@ def bend_link(link: Link, attached: tuple[int, int], warps: dict[int, Warp]) -> 
 def hold(submap: Submap, knots: Sequence[int], covariances: FloatArray, held: frozenset[int]) -> frozenset[int]:
     """Let relative poses from knot to knot hold a submap's shape; return the keyframes that have one.
 
-    A submap's own graph knows its projections only: solved again, it would straighten itself out. What another front
-    end said of a keyframe (a gap relocalisation) is not written over.
+    A submap's own graph knows its projections only, and would straighten itself out. What another front end said of a
+    keyframe (a gap relocalisation) is not written over.
 
     - `knots`: keyframes, ascending.
     - `covariances` (K - 1, 7, 7): of the similarities between neighbours, as the submap's own factors give them.

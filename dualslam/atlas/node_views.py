@@ -1,7 +1,4 @@
-"""Views of a submap's nodes: which of them are tied, and how deep the scene is. Cached until it changes.
-
-Most submaps of a long run are full: between two solutions of the atlas none of this changes in them.
-"""
+"""Views of a submap's nodes: which of them are tied, and how deep the scene is. Cached until it changes."""
 
 from __future__ import annotations
 

@@ -21,9 +21,7 @@ from dualslam.map.submap_change import change_of_frame
 def propagate_poses(poses: Iterable[FramePose], before: Submap, after: Submap) -> list[FramePose]:
     """Move the frames of a submap with it: a solution or a change of calibration bends the whole map.
 
-    A pose relative to one keyframe would follow that keyframe rigidly, though lengths and turns have changed as well.
-    Each frame is therefore carried by the keyframes before and after it in time, in proportion to its distance from
-    them.
+    Each frame is carried by the keyframes before and after it in time, in proportion to its distance from them.
 
     - `poses`: those of other submaps are passed over.
     - `before`, `after`: two states of the submap, in about the same frame.
@@ -69,9 +67,8 @@ def _propagate(
 def follow_keyframes(
     S_a_b: FloatArray, covariance: FloatArray, then: tuple[FloatArray, FloatArray], now: tuple[FloatArray, FloatArray]
 ) -> tuple[FloatArray, FloatArray]:
-    """Return a similarity between two submaps, and its covariance, as a keyframe of each has moved.
-
-    What holds is how the two keyframes lie to each other.
+    """Return a similarity between two submaps, and its covariance, as a keyframe of each has moved: what holds is how
+    the two keyframes lie to each other.
 
     - `S_a_b` (4, 4).
     - `covariance` (7, 7): in the frame of b.
@@ -126,8 +123,7 @@ def rows_of_frames(record: Record, submap: Submap, at_most: int, min_inliers: in
 def pose_frames_anew(record: Record, submap: Submap, shape: float, min_inliers: int) -> int:
     """Pose the frames of a submap that are no keyframes of it by its landmarks; return how many were.
 
-    A frame was tracked by landmarks as they were then; young ones may have been far off, and keyframes were mended with
-    them (docs/notes/2026-11-27-frames-posed-anew-at-the-end.md).
+    A frame was tracked by landmarks as they were then (docs/notes/2026-11-27-frames-posed-anew-at-the-end.md).
 
     - `submap`: as it stays.
     - `shape`: of the loss under which it was refined, in the pixels' sigmas.

@@ -1,9 +1,8 @@
 """The atlas as a graph over Sim(3): a sparse skeleton of each submap's keyframes, and the connections between them.
 
-Each tenth keyframe of a submap is a node, those at which connections are attached, and those of its gauge. Neighbours
-along the frames are tied by what the submap itself says of them, and so are places between which many landmarks are
-shared: where a camera looks at the same desk all the time, the map is stiff. What earlier solutions have bent is taken
-out of these measurements (`Atlas.warps`): a bend is no evidence.
+Nodes are each tenth keyframe of a submap, those of its gauge, and those at which connections are attached. Neighbours
+along the frames are tied by what the submap itself says of them, and so are places that share many landmarks. What
+earlier solutions have bent is taken out of these measurements (`Atlas.warps`): a bend is no evidence.
 """
 
 from __future__ import annotations
@@ -27,11 +26,10 @@ WITHIN = "within"
 STRIDE = 10
 """Keyframes from one node to the next."""
 DRIFT, MODEL_SHARE = 2.0, 0.01
-"""What a submap's factors say of its inner similarities is not all: pixels know nothing of a lens that is not quite the
-one that was assumed, or of a shutter. Sigmas are taken `DRIFT` times, and to them comes a share of the motion (turn in
-radians, way in depths of the scene). Chosen on `tum_fr1_rpy`, `hololens_000` and two rendered streets, at 10 and 20
-keyframes: RMS errors over what the factors say are 0.8 to 2.2 where the camera is exact, 2.4 to 18 on the sequences.
-With these numbers they are 0.03 to 0.3, and 0.7 to 2.5 (a submap with a broken stretch: to 5)."""
+"""What a submap's factors say of its inner similarities is not all: pixels know nothing of a wrong lens or shutter.
+Sigmas are taken `DRIFT` times, and to them comes a share of the motion (turn in radians, way in depths of the scene).
+With these, errors on `tum_fr1_rpy`, `hololens_000` and two rendered streets are 0.03 to 2.5 sigmas (5 for a broken
+submap)."""
 
 Node = tuple[int, int]
 """Submap and keyframe."""
@@ -166,10 +164,7 @@ def _nearest(knots: list[int], k: int) -> int:
 def _within(
     atlas: Atlas, views: Mapping[int, NodeView], rows: Mapping[int, range], T: FloatArray, covariances: Covariances
 ) -> tuple[AtlasEdges, dict[int, FloatArray]]:
-    """Tie the nodes of submaps to each other, as these say themselves; also what their factors say from node to node.
-
-    All submaps at once: many short arrays would take longer than the numbers in them.
-    """
+    """Tie the nodes of submaps to each other, as these say themselves; also return what their factors say."""
     S, depth = T.copy(), np.empty(len(T))
     steps: dict[int, FloatArray] = {}
     all_own_C: list[FloatArray] = []
@@ -215,8 +210,7 @@ def _joined_edges(a: AtlasEdges, b: AtlasEdges) -> AtlasEdges:
 def _are_torn(own: FloatArray, now: FloatArray, covariances: FloatArray) -> BoolArray:
     """Whether two places of each pair were bent together that nothing tied at the time.
 
-    What they share now resulted from that: landmarks of a loop that became one. The loop's own factor says it, and a
-    tie that had the bend taken out of it would deny it.
+    What they share now resulted from that, and the loop's own factor says it.
     """
     off = sim3.log(sim3.inverse(own) @ now)
     return squared_distances(off, covariances) > CHI2_999[7]

@@ -1,9 +1,4 @@
-"""Removal of dead rows and culled keyframes from a map that a run continues.
-
-While a run lasts, rows of landmarks only grow, dead observations are up to half of theirs
-(`dualslam/map/submap_delta.py`), and culled keyframes stay as anchors. A map that is used many times would carry those
-of all runs.
-"""
+"""Removal of dead rows and culled keyframes, which accumulate, from a map that a run continues."""
 
 from __future__ import annotations
 

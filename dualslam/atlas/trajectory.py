@@ -129,9 +129,7 @@ class Worlds:
         self._sure: set[int] = set()
 
     def of(self, submap_id: int) -> tuple[FloatArray, int]:
-        """Return where a submap lies in its world, and whose frame that is.
-
-        Returns the current ``S_world_submap`` (4, 4), and the submap whose frame and unit the world has: the first of
+        """Return the current ``S_world_submap`` (4, 4), and the submap whose frame and unit the world has: the first of
         its linked set, or the saved map's.
         """
         self._compose()

@@ -1,8 +1,7 @@
 """The frames' own count, by which all of the system goes: it ascends as they come.
 
-A source may be read from its end, and a run may continue a saved map, whose frames have numbers already. Here alone
-that is known: inside, the older of two frames is the one with the smaller number; rows and files tell a frame by its
-index in the source.
+Here alone it is known that a source is read from its end, or that a saved map's frames have numbers already. Rows and
+files tell a frame by its index in the source.
 """
 
 from __future__ import annotations

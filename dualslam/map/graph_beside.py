@@ -1,11 +1,10 @@
 """A submap's graph in a process of its own: the tracking solves a window meanwhile, and takes the whole when it comes.
 
-`BesideGraph` is the `SubmapGraph` that the tracking sees. Its updates adjust the newest keyframes (`WindowSolver`), and
-note that the graph proper has something to learn. Between two frames `BesideGraphs` sends the changes of the arrays
-(`dualslam/map/submap_delta.py`) to the process, one job at a time. A graph that is behind so takes several keyframes at
-once. It puts the result into the current submap: known keyframes and landmarks take their values, and newer ones
-follow. A process that dies costs its graph: the next job brings the whole submap to a fresh one. A graph that fails
-leaves the submap to its window, and is made anew with the next keyframe.
+`BesideGraph` is the `SubmapGraph` that the tracking sees. Its updates adjust the newest keyframes (`WindowSolver`).
+Between two frames `BesideGraphs` sends the changes of the arrays (`dualslam/map/submap_delta.py`) to the process, one
+job at a time. It puts the result into the current submap: known keyframes and landmarks take their values, and newer
+ones follow. A process that dies costs its graph: the next job brings the whole submap to a fresh one. A graph that
+fails leaves the submap to its window, and is made anew with the next keyframe.
 """
 
 from __future__ import annotations
@@ -125,8 +124,8 @@ class BesideGraph:
     def rebuild(self, submap: Submap, near_optimum: bool = False) -> GraphEstimate:
         """Let the graph be made anew; meanwhile the submap stays as it is.
 
-        Not one that is near its optimum and known to the process, in real time: for a batch, which takes as long as
-        ten updates, the tracking would have to go on from windows alone where it is hardest. That is an update.
+        In real time, one near its optimum and known to the process is only updated: a batch takes as long as ten
+        updates.
         """
         if near_optimum and self.mirror.knows_replica and self._in_real_time():
             return self.update(submap)

@@ -72,9 +72,7 @@ def pixel_covariances(
 def triangulate_landmarks(submap: Submap, landmark_ids: IntArray, before: int) -> FloatArray:
     """Return the places (N, 3) of landmarks as the keyframes older than one alone triangulate them.
 
-    NaN where fewer than two of these see a landmark.
-
-    `landmark_ids` (N,) int64: each once.
+    NaN where fewer than two of these see a landmark. `landmark_ids` (N,) int64: each once.
     """
     rows, point = _views(submap, landmark_ids, before)
     if len(rows) == 0:

@@ -106,8 +106,8 @@ class Calibration:
     def is_due(self, submap: Submap, is_waited_for: bool = False) -> bool:
         """Whether it is time to ask this submap.
 
-        `is_waited_for`: a lost map waits to be joined to it. A wrong camera bends the two in different ways, so that no
-        similarity fits both. Then it is asked as soon as it may answer.
+        `is_waited_for`: a lost map waits to be joined to it, which no similarity does under a wrong camera. Then it is
+        asked as soon as it may answer.
         """
         if self._refined_in not in (None, submap.id):
             return False  # what a longer submap said of the lens is not put at risk by a shorter one
@@ -198,8 +198,7 @@ class Calibration:
     def update(self, submap: Submap, graph: SubmapGraph) -> Submap | Failure:
         """Change a submap that an earlier camera made to the present one; return a copy of it as it was.
 
-        It was the same lens: what a longer map says of it is true of this one too. Two maps of different cameras have
-        different shapes, and would not be linked.
+        It was the same lens, and maps of different cameras have different shapes, which would not be linked.
         """
         try:
             return self._change(submap, self._camera, graph)

@@ -90,10 +90,7 @@ def sound_copy(submap: Submap) -> Submap:
 
 
 def _widest_pair(submap: Submap, keyframe_ids: list[int]) -> tuple[int, int]:
-    """Return the two keyframes that are farthest apart: a distance that is known the better the longer it is.
-
-    The first and the last one may stand side by side, where a hand moves to and fro.
-    """
+    """Return the two keyframes that are farthest apart: a distance that is known the better the longer it is."""
     centres = se3.translation(submap.keyframe_poses(keyframe_ids))
     apart = np.linalg.norm(centres[:, None] - centres, axis=2)
     first, second = np.unravel_index(int(apart.argmax()), apart.shape)

@@ -17,9 +17,8 @@ def change_of_frame(
 ) -> FloatArray:
     """Return ``S_after_before``, which takes the surroundings of some keyframes from one state of a map to the other.
 
-    A solved map bends, so that no single similarity holds for all of it. This one holds about `keyframe_ids`: it turns
-    and shifts as their poses did on average, and scales as the median depth of what they see. (Distances between
-    cameras would not tell the scale of a turn in place.)
+    It holds about `keyframe_ids` alone, as a solved map bends: it turns and shifts as their poses did on average, and
+    scales as the median depth of what they see.
 
     - `before`, `after`: two states of one submap.
     - `keyframe_ids`: at least one of them stands in both.

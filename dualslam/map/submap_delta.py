@@ -126,8 +126,7 @@ class SubmapMirror:
     def delta(self, submap: Submap) -> SubmapDelta:
         """Return what brings the replica up to date with a submap, and take it as done.
 
-        Where the camera has changed, all pixels have: the replica is made anew. So it is where rows have left the table
-        without the mirror's knowledge.
+        Where the camera has changed, or rows have left the table without the mirror's knowledge, it is made anew.
         """
         renumbered = submap.n_dropped != self._n_dropped
         is_new = self._K is None or renumbered or bool((self._K != submap.K).any())
@@ -197,13 +196,7 @@ log = logging.getLogger(__name__)
 def drop_dead_rows(submap: Submap, graph: SubmapGraph) -> int:
     """Take out of a submap's table the rows that are dead and followed no more, once they outnumber the live ones.
 
-    The table is therefore never more than about twice as long as it must be. A drop costs a copy of the live rows; as
-    many rows have come and died since the last one: a constant for each.
-
-    `graph`: all that follows this submap by the numbers of its rows. (One that does not hear of it makes its state
-    anew.)
-
-    Returns int: how many rows have gone.
+    `graph`: all that follows this submap by the numbers of its rows. Returns how many rows have gone.
     """
     n, n_alive = len(submap.observations), int(np.count_nonzero(submap.observations["alive"]))
     least = max(MIN_DEAD, n_alive + 1)

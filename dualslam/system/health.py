@@ -58,8 +58,8 @@ class FrameHealth:
 class HealthMonitor:
     """Judges the frames of one submap one after the other, each against what the frames before it were like.
 
-    The motion model's error has no sigma that could be known beforehand: a car and a hand differ. It is measured on the
-    frames of the last seconds. So is the level of the chi-square, which contains the camera model's own error.
+    The motion model's error and the level of the chi-square, which contains the camera model's error, are those of the
+    last seconds.
     """
 
     def __init__(self, config: HealthConfig) -> None:

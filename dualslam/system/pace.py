@@ -1,12 +1,9 @@
-"""Whether the system keeps up with its camera, and what it leaves out where it does not.
+"""Whether the system keeps up with its camera, and what it leaves out where it does not; only real time has a pace.
 
-Two things can be behind. The tracking is if frames are processed after their time. The back end is if more keyframes
-wait for its graph than it can catch up on. In either case keyframes are what there is to save: each costs the tracking
-its insertion and the back end its solution. One that is due but not urgent is put off until both have caught up. While
-there is no map, a start is looked for beside the frames (`workers/start_beside.py`), or, without processes, by one pair
-of frames at a time: a start that comes late costs more than frames that are dropped.
-
-Only real time has a pace. Without it nothing here ever changes what a run does.
+The tracking is behind if frames are processed after their time. The back end is behind if more keyframes wait for its
+graph than it can catch up on. In either case a keyframe that is due but not urgent is put off until both have caught
+up. While there is no map, a start is looked for beside the frames (`workers/start_beside.py`), or, without processes,
+by one pair of frames at a time: a start that comes late costs more than frames that are dropped.
 """
 
 from __future__ import annotations

@@ -26,9 +26,8 @@ EARLY_FRAMES = 8
 """Lost frames up to which no pair of them lies eight apart, as the pairs do that a start is mostly made of."""
 FIRM_SIGMA_DEG = 0.25
 """Of the direction of translation of a start, up to which reverse tracking from it crosses a gap as well as from a
-later one: over 1 to 1.5 s without frames (`kitti_03`, three places) the link's scale was known to 0.6 to 1.0 % from
-starts of 0.20 to 0.27 degrees. It was known to 1.1 to 1.6 % up to 0.38, and to 1.7 % at best from 0.45 and more, after
-tries in vain."""
+later one. Over 1 to 1.5 s without frames (`kitti_03`) such starts gave the link's scale to 0.6 to 1.0 %, others to 1.1
+to 1.7 %."""
 
 REACH_IN_TIME = 64
 """As `START_REACH` in real time, of frames whose pixels have changed: three seconds of them take 0.2 s."""
@@ -151,10 +150,7 @@ class Starting:
             decisions.note(Decision.refused(view.index, DecisionKind.START, None, why))
 
     def foresee(self) -> None:
-        """Let what the next walk may ask for on either side of a loss be found while no map has started to walk from.
-
-        On this side it is the first frame that shows something.
-        """
+        """Let what the next walk may ask for on either side of a loss be found while there is no map to walk from."""
         self._foresee = foresee = self._state.parts.foresee
         if foresee is None:
             return

@@ -1,8 +1,8 @@
 """Search for points of one image in another by their patches, without a detector.
 
 A detector finds a third of its points again at twice the distance. Where a point's place and size are predicted, a
-small patch about it is resampled as the other camera sees it, at the coarser image's resolution, and moved over the
-predicted place.
+small patch about it is resampled as the other camera sees it. It is moved over the predicted place, at the coarser
+image's resolution.
 """
 
 from __future__ import annotations

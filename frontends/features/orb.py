@@ -97,12 +97,7 @@ class OrbFrontend(OptionedFrontend):
         self._moments = _moment_weights()
 
     def extract(self, image: NDArray[np.uint8]) -> Features:
-        """Detect and describe up to `n_features` corners, the finest octave first.
-
-        `image` (H, W) or (H, W, 3) RGB uint8: of any size; a flat or a tiny one has no features.
-
-        Raises `InputError`: the array is no such image.
-        """
+        """Detect and describe up to `n_features` corners, as `Frontend.extract` says, the finest octave first."""
         levels = self._pyramid(to_grey(image))
         noise = noise_of_levels(estimate_noise(levels[0]), len(levels), self.scale_factor)
         corners = self._corners(levels, noise)

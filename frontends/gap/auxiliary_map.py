@@ -182,10 +182,7 @@ class OwnFeatures:
 
 
 class BufferedFeatures:
-    """Those that another front end finds in the buffered images. Implements `AuxiliaryFeatures`.
-
-    `model_sigma_px`: see `CameraConfig.model_sigma_px`.
-    """
+    """Features that another front end finds in the buffered images. Implements `AuxiliaryFeatures`."""
 
     def __init__(self, images: ImageFeatures, model_sigma_px: float, camera: Camera) -> None:
         self._images = images

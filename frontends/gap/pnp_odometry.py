@@ -2,9 +2,9 @@
 
 Features of another front end, found in the buffered images, are matched from frame to frame. Their points, triangulated
 from the frames before, give each frame's pose by PnP. Under it the live front end finds the submap's landmarks, which
-makes the frame a keyframe like any other; the factor graph solves for the pose anew.
+makes the frame a keyframe like any other. The factor graph solves for the pose anew.
 
-With `tracks_live` the live front end tracks as far as it can, ten times as fast, and only the frames where it fails are
+With `tracks_live` the live front end tracks as far as it can, ten times as fast. Only the frames where it fails are
 posed so. Its own features are matched wide first, since they exist already.
 
 Where the next frame cannot be posed so (blur, black-out, frames that are missing) the odometry crosses the gap

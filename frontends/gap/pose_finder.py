@@ -270,8 +270,8 @@ class PoseFinder:
     def _small_step(self, view: View, found: GapPose, last: int) -> Track | None:
         """Let the submap's landmarks decide where the auxiliary matches alone do not, if the camera has hardly moved.
 
-        A hand-held camera turns fast and moves little: few of the matched points have the parallax to keep the scale,
-        which a step that is small against the depth of the landmarks in view does not change.
+        A hand-held camera turns fast and moves little: few of the matched points have the parallax to keep the scale. A
+        step that is small against the depth of the landmarks in view does not change it.
         """
         track = judge_track(self._live.track_near(view, found.T_cam_submap), self._config.health)
         if isinstance(track, Failure):

@@ -1,7 +1,7 @@
 """Landmarks of one side of a gap, found again on the other side in the images themselves.
 
-The map's scale beyond unusable frames, or after wide matching, depends on landmarks seen on both sides, of which the
-detector finds few at half or twice the distance. With the pose roughly known, the keyframes beyond the gap are searched
+The map's scale beyond unusable frames, or after wide matching, depends on landmarks seen on both sides. The detector
+finds few of these at half or twice the distance. With the pose roughly known, the keyframes beyond the gap are searched
 for the landmarks of the last keyframes before it, by their image patches. Each find becomes a feature like any other.
 
 The pose of a gap relocalisation comes from few matches over a long way. There a landmark is looked for once its place

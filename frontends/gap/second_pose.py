@@ -1,7 +1,7 @@
 """Test for a second pose beyond a gap that explains nearly as much as the first: then the scene repeats itself.
 
-A ratio test removes just the matches that would show a repetition. So every point is paired with all similar features,
-the pairs that the first pose explains are removed, and the rest is searched for another pose. (The same test for two
+A ratio test removes just the matches that would show a repetition. So every point is paired with all similar features.
+The pairs that the first pose explains are removed, and the rest is searched for another pose. (The same test for two
 maps: `dualslam/places/sides.py`.)
 
 What a pose explains is counted among the points that it has in view: by number alone a pose near the last one before

@@ -1,13 +1,10 @@
 """The focal length and the lens of a camera of which nothing is known, from the first seconds of its video.
 
 Each pair of frames is compared with every camera of a grid: a focal length, and one number for the lens (the division
-model of Fitzgibbon, 2001). For each camera the relative pose is estimated (RANSAC and refinement of PoseLib) and the
-robust cost of the epipolar constraint is kept. An uninformative pair (a straight drive, a plane, a turn on the spot)
-has a flat cost and no effect. A solver for its focal length would return some number. The sum over the pairs is lowest
-at the right camera. Self-calibration goes on from there.
-
-The lens has to be asked for with the focal length: without it, a wide lens (EuRoC's) is taken for a camera of twice the
-focal length.
+model of Fitzgibbon, 2001). Without it, a wide lens is taken for twice the focal length. For each camera the relative
+pose is estimated (RANSAC and refinement of PoseLib) and the robust cost of the epipolar constraint is kept. An
+uninformative pair (a straight drive, a plane, a turn on the spot) has a flat cost and no effect. The sum over the pairs
+is lowest at the right camera. Self-calibration goes on from there.
 """
 
 from __future__ import annotations
@@ -226,10 +223,7 @@ def _K(focal: float) -> FloatArray:
 
 
 def _log_prior(log_focal: FloatArray, lens: FloatArray, told: ToldFocal | None) -> FloatArray:
-    """Return the logarithm of the prior of cameras, of the shape that both make together.
-
-    `told`: the focal length in the source's own data, which is right as a rule.
-    """
+    """Return the logarithm of the prior of cameras, of the shape that both make together."""
     of_focal = _log_normal(log_focal, *LOG_FOCAL_PRIOR)
     if told is not None:
         right, wrong = _log_normal(log_focal, math.log(told.over_side), told.log_sigma), of_focal
@@ -253,10 +247,7 @@ def _log_likelihood(costs: FloatArray, on_grid: FloatArray, pairs: Sequence[_Pai
 def _between_nodes(
     pairs: Sequence[_Pair], costs: FloatArray, side: int, log_focal: float, lens: float | None, told: ToldFocal | None
 ) -> tuple[float, float]:
-    """Return the best log focal length and lens near a node of the grid, which is coarser than many pairs are sure.
-
-    Without a lens none is looked for.
-    """
+    """Return the best log focal length and lens near a node of the grid; without a lens none is looked for."""
     poses = [pair.straightened(lens or 0.0).fresh_pose(side * np.exp(log_focal)) for pair in pairs]
 
     def misfit(x: np.ndarray[tuple[int], np.dtype[np.float64]]) -> float:

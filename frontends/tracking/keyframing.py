@@ -1,8 +1,6 @@
 """When a tracked frame becomes a keyframe: by its parallax, or as the camera has moved past unmapped image content.
 
-Known content gives the parallax. A bench that comes into view beside a far wall has nothing mapped on it yet. It moves
-by a quarter of the image while the wall hardly does. When the wall asks for a keyframe, the bench has gone or is too
-close.
+Known content gives the parallax: a bench before a far wall moves by a quarter of the image while the wall hardly does.
 """
 
 from __future__ import annotations
@@ -64,8 +62,7 @@ def keyframe_due(track: Track, submap: Submap, reference_id: int, config: Keyfra
 def keyframe_like(track: Track, submap: Submap, first_id: int, config: KeyframeConfig) -> int | None:
     """Return the keyframe of an earlier run that makes one of this frame superfluous, if there is one.
 
-    That keyframe sees the same from much the same place. Whether the frame's own content is found there, or has
-    changed, does not matter as long as enough of the map is.
+    It sees the same from much the same place; whether the frame's own content is found there does not matter.
 
     `first_id`: number of this run's first frame.
     """
@@ -144,8 +141,8 @@ def passes_unmapped(
 
     - `track`: of a frame.
     - `keyframe_id`: of the submap: the last keyframe.
-    - `parallax_deg`: at which a keyframe is due if what is mapped shows it. From 1 degree on a match could be a
-      landmark, but with that, keyframes came in turns on the spot as well. They broke maps of `tum_fr1_rpy`.
+    - `parallax_deg`: at which a keyframe is due if what is mapped shows it. At 1 degree, turns on the spot make some
+      too.
     - `n`: so many matches must show it.
     """
     features, keyframe = track.view.features, submap.keyframes[keyframe_id].features

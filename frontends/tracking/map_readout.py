@@ -1,9 +1,8 @@
 """The readout time of a rolling shutter, by what a map's own observations say of it.
 
 In a bundle of the keyframes that turn fast it is one more unknown, beside their poses and points: the camera sees each
-row in another orientation, and the frames around it give the rate of turn. A map shows it far more finely than pairs of
-frames do, since its points are known from other views: 0.2 ms on a fast walk and 1.3 ms on a hand-held camera, by the
-residuals' own noise. Pairs only separate 20 ms from none.
+row in another orientation, and the frames around it give the rate of turn. A map, whose points are known from other
+views, shows it to about a millisecond; pairs of frames only separate 20 ms from none.
 """
 
 from __future__ import annotations

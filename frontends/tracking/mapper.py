@@ -85,10 +85,9 @@ class Mapper:
     def grow(self, track: Track, apart: Set[int] = frozenset(), noise2: float = 1.0) -> None:
         """Grow the map about the keyframe that a tracked frame has become, from the current poses.
 
-        `apart`: keyframes across a gap, with which nothing new is triangulated. What few landmarks tie to each other
-        has epipolar lines that are off, on which half of what is found is wrong (rendered streets: 65 of 130), each of
-        it by a depth that confirms the poses. `noise2`: variance of the map's whitened residuals. Observations that fit
-        worse are admitted neither as a new landmark nor as another view of one. Noisier pixels do not widen the gate.
+        - `apart`: keyframes across a gap, with which nothing new is triangulated: few landmarks tie them, so that their
+          epipolar lines are off, and false matches get depths that confirm the poses.
+        - `noise2`: variance of the map's whitened residuals. Observations that fit worse are not admitted.
         """
         view = track.view
         self._gate_chi2 = CHI2_95[2] * min(noise2, 1.0)
@@ -191,9 +190,8 @@ class Mapper:
     def _triangulate(self, k: int, neighbours: list[int], candidates: BoolArray) -> IntArray:
         """Triangulate the keyframe's free features against several older keyframes.
 
-        A camera that turns towards far scenery finds matches there, but no landmarks. Far points hold its rotation
-        until near ones come into view again. A keyframe with landmarks enough does without them: on a road the depths
-        of far points err towards near.
+        If matches bring too few landmarks, far points are taken too: they hold the rotation until near ones come into
+        view. A keyframe with landmarks enough does without: the depths of far points err towards near.
         """
         near_deg = MIN_PARALLAX_DEG
         created = [self._triangulate_pair(k, other, candidates, near_deg) for other in neighbours]

@@ -13,15 +13,11 @@ is twice as long."""
 
 
 def nearer_than_proven(depth: FloatArray, proven: BoolArray) -> BoolArray:
-    """Return which points are unproven, and nearer than any proof reaches.
+    """Return which points (N,) of depths (N,) are unproven, and nearer than any proof reaches; none where nothing is
+    proven.
 
-    On a scene that repeats itself wrong matches lie on the epipolar line, too: as points at any depth. Of these the
-    near ones weigh most: they hold the camera where it is, and a turn takes the place of its motion. Where true points
-    are near, some are proven, and unproven ones beside them stay.
-
-    `depth` (N,), `proven` (N,) bool.
-
-    Returns (N,) bool: all False where nothing is proven.
+    On a scene that repeats itself wrong matches lie on the epipolar line, too, at any depth. Near ones weigh most: they
+    hold the camera where it is, and a turn takes the place of its motion. Where true points are near, some are proven.
     """
     if not proven.any():
         return np.zeros(len(depth), np.bool_)

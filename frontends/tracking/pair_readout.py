@@ -126,8 +126,7 @@ class ReadoutEstimator:
         result is for a typical time with the rows read the other way round.
 
         RANSAC gives the poses for the shortest and the longest time. From there each pose is refined from that of the
-        neighbouring time, upwards and downwards. RANSAC's own scatter would hide the differences between times. A
-        refinement from far off stays in another minimum than its neighbours' (a step of 18 between two times).
+        neighbouring time, upwards and downwards: RANSAC's own scatter would hide the differences between times.
         """
         sigma_px = np.sqrt(0.5 * (a.sigma_px**2 + b.sigma_px**2))
         lens = poselib_camera(camera.K, camera.size_px)
@@ -165,10 +164,6 @@ def _minimum(chi2: FloatArray, best: int) -> float:
 
 
 def _mean(chi2: FloatArray) -> float:
-    """Return the mean over all readout times that are tried, each as likely as it fits.
-
-    Of a few turns the best one jumps between the middle and the rim (0.020 and 0.035 s on ``tum_fr1_rpy``, where the
-    whole says 0.026).
-    """
+    """Return the mean over all readout times that are tried, each as likely as it fits: the best of few turns jumps."""
     weight = np.exp(-0.5 * (chi2 - chi2.min()) / INFLATION**2)
     return float(weight @ READOUTS_S / weight.sum())

@@ -130,8 +130,8 @@ class PatchAlignment:
     def _pairs(self, submap: Submap, rows: IntArray) -> _Pairs:
         """Return the observations that have a reference, each with it.
 
-        The reference is the observation that first described the landmark. Where its image is not kept, or shows the
-        landmark in another size, it is the farthest in time.
+        The reference first described the landmark. Where its image is not kept, or shows another size, it is the
+        farthest in time.
         """
         obs, first = submap.observations, submap.landmarks["first_kf"]
         kept = np.array(sorted(k for k in submap.keyframes if k in self._images), np.int64)

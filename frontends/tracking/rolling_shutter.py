@@ -94,10 +94,7 @@ class RollingShutter:
         return self._corrected(view, camera, rate_rad_s)
 
     def all_corrected(self, views: Iterable[View], camera: Camera) -> list[View]:
-        """Take the turns out of the frames that came before the shutter was found, or found anew, in their order.
-
-        The turns that are known serve again; only the others are measured now.
-        """
+        """Take the turns out of the frames that came before the shutter was found, or found anew, in their order."""
         meter = TurnMeter(self._frontend)
         corrected = []
         for view in views:
@@ -135,7 +132,6 @@ class RollingShutter:
         """Whether a map may start from this view, found while there is none; what it tells of the shutter is taken in.
 
         Of a camera that turns fast, with a shutter that is likely to roll, the rows' shifts would pass for parallax.
-        A map that lives is asked itself (`ask`).
         """
         if self._estimator is None:
             return True

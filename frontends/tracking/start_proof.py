@@ -98,9 +98,8 @@ class StartProof:
     def _confirm(self, witness: View, first: View, feature: IntArray, xyz: FloatArray) -> _Witness | Failure:
         """Pose a witness from the points alone, without a guess, and count how many of its matches agree.
 
-        Two views do not prove a few that stand far before all others: where they are enough to fix a pose, they have no
-        say in the one that is to prove them. Of what repeats itself they are copies, and would turn the witness until
-        it agreed with them.
+        A few points far before all others have no say in the pose that is to prove them: copies of what repeats itself
+        would turn the witness until it agreed with them.
         """
         matches = self._frontend.match_wide(first.features.take(feature), witness.features)
         if len(matches) < START_POINTS // 2:

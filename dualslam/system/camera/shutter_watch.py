@@ -1,9 +1,8 @@
 """The shutter of a live map: how long its images were read is asked of the map itself, and taken out of all it is in.
 
-Before a map starts, pairs of frames give a readout time to five or ten milliseconds. If the camera does not turn fast
-just then, they give nothing. A map tells it to a fraction of one (`frontends/tracking/map_readout.py`). It matters:
-where a camera turns fast, few landmarks are seen from both sides of the turn. Each millisecond of readout on a fast
-walk moves the scale behind such a turn by 4 %, which nothing else shows.
+Pairs of frames give a readout time to five or ten milliseconds, if the camera turns fast. A map tells it to a fraction
+of one (`frontends/tracking/map_readout.py`). Where few landmarks are seen from both sides of a fast turn, each
+millisecond moves the scale behind it by 4 %.
 """
 
 from __future__ import annotations
@@ -63,7 +62,7 @@ def with_turn_of_poses(
 ) -> Track:
     """Return a frame that is to become a keyframe with the turn taken out of its pixels that its pose tells.
 
-    Matches to the frame before tell it before there is a pose, and take a part of what the camera has moved for a turn.
+    Matches to the frame before tell it before there is a pose, with a part of the motion in it.
 
     - `submap`: in which the frame is posed.
     - `before`: of the frame before it.

@@ -265,8 +265,8 @@ class LevelFeatures:
 def _between_pixels(peak: torch.Tensor, response: torch.Tensor) -> tuple[FloatArray, BoolArray, FloatArray]:
     """Fit a parabola to the 3 x 3 neighbourhood of each peak (H, W) of a level; none of them is at the edge.
 
-    Returns the maxima (N, 2), row by row, or the pixel where the parabola has none within 0.75 px; whether it has one;
-    and the response at the pixel.
+    Returns the maxima (N, 2), row by row, whether the parabola has one within 0.75 px (else it is the pixel), and the
+    response at the pixel.
     """
     v, u = torch.nonzero(peak, as_tuple=True)
     step = torch.arange(-1, 2, device=peak.device)
