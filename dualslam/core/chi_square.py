@@ -35,8 +35,7 @@ def variance_by_median(chi2: FloatArray, n_views: IntArray) -> float:
     """Return the variance of whitened pixel residuals, by their median: 1 where the pixels' sigmas are right.
 
     - `chi2` (R,): squared whitened residuals (2 degrees of freedom) of observations.
-    - `n_views` (R,): views that each one's landmark has, at least 2. The landmark takes 3 of their ``2 n`` numbers,
-      which is given back.
+    - `n_views` (R,): views that each one's landmark has, at least 2; it takes 3 of their ``2 n`` numbers.
     """
     return float(np.median(chi2 / (1 - 1.5 / n_views))) / MEDIAN_CHI2[2]
 

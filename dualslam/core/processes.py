@@ -10,8 +10,8 @@ from multiprocessing.process import BaseProcess
 def start_undisturbed(process: BaseProcess) -> None:
     """Start a spawned process in which SIGINT is held back from its first instruction on.
 
-    An interrupt at the terminal reaches all processes of a run, and what becomes of the run is the first one's affair.
-    A process that only ignored it in its own code would die with a stack trace while it still imports.
+    An interrupt at the terminal reaches all processes of a run, and the first one's decides. A process that only
+    ignored it in its own code would die with a stack trace while it still imports.
     """
     resource_tracker.ensure_running()  # starting a process would do that, and lets signals through again
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})

@@ -19,9 +19,8 @@ LIMITS = {
 def limit_threads() -> bool:
     """Tell the numerical libraries, which read the environment when they are loaded, to use one thread each.
 
-    Our parallelism is processes, and BLAS threads on busy cores only wait.
-    Variables that the user has set are left as they are. Call it before numpy is imported, in a program of your own as
-    in ours; importing dualslam does not call it.
+    Our parallelism is processes, and BLAS threads on busy cores only wait. Variables that the user has set stay. Call
+    it before numpy is imported, in a program of your own as in ours; importing dualslam does not call it.
 
     Returns bool: false where numpy was loaded already, so that the limits came too late for it.
     """
@@ -46,10 +45,8 @@ LARGEST_BYTES = 32 * MB
 
 
 def keep_freed_memory() -> bool:
-    """Tell the C library to keep freed memory for what is allocated next.
-
-    glibc gives arrays of some size back to the system at once, which hands out fresh pages, zeroed, for the next ones:
-    a fifth of the CPU time of reverse tracking with SIFT on KITTI. Results are the same.
+    """Tell the C library to keep freed memory for what is allocated next, as fresh pages cost up to a fifth of the
+    time.
 
     Call it in a program of your own as in ours; importing dualslam does not call it.
 

@@ -43,11 +43,9 @@ DELAYS: Mapping[JobKind, float] = {
 """Frames after which an answer is used by default: twice the median CPU time of a job in frames of 30 Hz, and one more.
 
 Twice, since a worker has about half a core where tracking and features take the rest of two. One more, since answers
-come in where a frame begins. Medians of the jobs above 10 ms, in frames: start search 0.8, graph 0.8 (166 jobs), scale
-watch 0.7, readout 2.3, calibration 15, loop search 4.4, reverse tracking 8.2 (7 jobs, up to 35), edge covariances 6
-(docs/adr/0020-work-beside-tracking.md), atlas below 0.3. Measured on 110 to 180 frames each of `kitti_03` and
-`7scenes_1000` with black frames, `hololens_000` and `tum_fr1_rpy`: CPU time, which does not depend on what else runs.
-"""
+come in where a frame begins. Medians of the jobs above 10 ms, in frames: start search 0.8, graph 0.8, scale watch 0.7,
+readout 2.3, calibration 15, loop search 4.4, reverse tracking 8.2, edge covariances 6
+(docs/adr/0020-work-beside-tracking.md), atlas below 0.3."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

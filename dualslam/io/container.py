@@ -45,9 +45,8 @@ def equivalent_focal_mm(path: Path) -> float | None:
 
 
 def edited_s(path: Path) -> float | None:
-    """Return the seconds that the edit lists of a film leave of its longest track; None where it has none.
-
-    A clip that was trimmed without encoding it again has all of its frames, and a list of those that are played.
+    """Return the seconds that the edit lists of a film leave of its longest track, trimmed or not; None where it has
+    none.
     """
     try:
         with path.open("rb") as file:

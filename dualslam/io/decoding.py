@@ -1,7 +1,6 @@
 """Image files to pixels of eight bits, of sources that use fewer bits than their files have room for.
 
-Cameras of 10, 12 or 14 bits write files of 16. Read by their upper eight bits these would be nearly black; read each by
-its own brightest pixel, they would flicker. What is found holds for the whole source, whatever part of it is read.
+Cameras of 10, 12 or 14 bits write files of 16. What is found holds for the whole source, so that images do not flicker.
 """
 
 from __future__ import annotations

@@ -84,7 +84,6 @@ def fill_gaps(paths: Sequence[Path], expected: int) -> list[Path]:
     """Put the missing numbers back into a list of numbered files, if that makes it `expected` long.
 
     A sequence of which a few images were lost can then be read with those frames unreadable, each at its own time.
-    Where the numbers do not tell for sure which images are missing the list is returned as it is.
     """
     stems = [p.stem for p in paths]
     widths = {len(s) for s in stems}

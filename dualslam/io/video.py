@@ -37,10 +37,8 @@ _LIVE_QUEUE = 2
 WHOLE_SHARE = 0.95
 """Of the frames that a file announces: with fewer it was cut off. One that counts by duration and rate is a few off."""
 LOG_CROP, CROP_SIGMA = 0.12, 0.08
-"""By how much longer a video's focal length is than the equivalent that its container tells, and how sure that is: the
-logarithm's mean and sigma. A telephone reads a part of its sensor and keeps a rim for stabilisation: from nothing (an
-iPhone 13 without: 69.5 degrees at 3840 x 2160, where 27 mm are 69.9) to 0.25 (an iPhone 7's film shows 42.2 cm where
-its photograph, of 28 mm, shows 49.6)."""
+"""By how much longer a video's focal length is than the equivalent that its container tells: the logarithm's mean and
+sigma. A telephone reads a part of its sensor and keeps a rim for stabilisation: of two iPhones nothing, and 0.25."""
 
 
 def open_recording(path: Path) -> Recording:

@@ -38,10 +38,7 @@ class Correspondences:
     covariance_new: FloatArray  # (M, 3, 3)
     shared_pixel: BoolArray
     """(M,): whether both maps use the same keypoint of the same frame somewhere. The two points then share part of
-    their noise. With C their cross-covariance the residual's covariance is ``P_old + A P_new A' - C A' - A C'``; the
-    same pixel moves both points the same way, so C is positive, and omitting it inflates the covariance. Distances come
-    out small, sigmas large. (With C, pairs with all pixels in common would outweigh all others, though they are no
-    independent evidence.)"""
+    their noise. Their cross-covariance, which the residual's would be less by, is left out: sigmas come out large."""
     keyframes: IntArray  # (K,): shared keyframes with views, ascending: in order of time
     # Row of the pair, row of `keyframes`.
     view_pair: IntArray  # (V,)
@@ -98,14 +95,12 @@ def propose_correspondences(
 
     In each shared keyframe two landmarks are proposed as one if both maps use the same keypoint of the same image
     (identity). Otherwise their keypoints must be near, and their descriptors each other's nearest. Proposals of several
-    keyframes for the same pair are its views; a landmark with several proposals keeps the one with the most keyframes
-    (identity first). Pairs whose points are not fixed by their views are left out.
+    keyframes for the same pair are its views; a landmark with several keeps the one with the most keyframes (identity
+    first). Pairs whose points are not fixed by their views are left out.
 
     - `matcher`: without it pairs come from identity alone.
-    - `old_before`: the old map's keyframes from this one on are not believed: its points are placed anew by what the
-      older ones saw of them, and those that these do not fix are left out.
-
-    Returns Correspondences: possibly empty.
+    - `old_before`: the old map's points are placed anew by its keyframes older than this one, and those that these do
+      not fix are left out.
     """
     return place_pairs(old, new, match_landmarks(old, new, matcher), old_before)
 

@@ -24,12 +24,11 @@ def measure_deformation(
 ) -> float:
     """Return by how much drift changes the scale along time, less noise; at least half of what is expected.
 
-    The older and the newer half of the pairs, and the cameras' path, are each compared with the whole. Where drift is a
-    random walk, the mean over the overlap is off by about half of what its ends differ.
+    The older and the newer half of the pairs, and the cameras' path, are each compared with the whole. By a random walk
+    the mean over the overlap is off by about half of what its ends differ.
 
     - `S_old_new` (4, 4).
-    - `inliers` (M,) bool: pairs that agree with it.
-    - `keyframes` (K,) bool: keyframes that do.
+    - `inliers` (M,), `keyframes` (K,) bool: pairs and keyframes that agree with it.
     """
     c = model.pairs
     views = inliers[c.view_pair] & keyframes[c.view_keyframe]
@@ -46,8 +45,7 @@ def measure_deformation(
 def deformation_covariance(model: PairModel, deformation: float) -> FloatArray:
     """Return (7, 7) that a deformation adds to a link's covariance (right perturbation, frame new).
 
-    The pairs all bend together, so that more of them do not help. In scale and in position relative to the landmarks'
-    distance, that is; orientation drifts less.
+    All pairs bend together, in scale and in position relative to the landmarks' distance; orientation drifts less.
     """
     distance = np.linalg.norm(model.pairs.xyz_new[:, None] - model.T_new_kf[None, :, :3, 3], axis=2)
     sigma = np.repeat([ROTATION_SHARE, float(np.median(distance)), 1.0], [3, 3, 1]) * deformation
@@ -69,8 +67,8 @@ def _change_of_path(model: PairModel, S_old_new: FloatArray, keyframes: BoolArra
     """Compare the scale of the cameras' path with that of the landmarks: in a sound map these two agree.
 
     A centre is known to about one pixel at the landmarks' distance, over the root of their number. Along the optical
-    axis it is several times worse. It matters where landmarks are seen in the healthy part but were placed by what the
-    corrupted one saw of them: they then agree with each other in a wrong scale, and only the path is right.
+    axis it is several times worse. Landmarks that were placed by what a corrupted part saw agree with each other in a
+    wrong scale: only the path is right.
     """
     centres = model.T_old_kf[keyframes, :3, 3]
     moved = sim3.act(S_old_new, model.T_new_kf[keyframes, :3, 3])

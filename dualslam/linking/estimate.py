@@ -3,9 +3,8 @@
 Source: Huang et al., "Dual-SLAM", section II (Map Fusion): ``X' = s R X + T`` by RANSAC with Horn's algorithm over
 3D-3D matches restricted to equal keyframes. The consensus along time, the reprojections and the gates are ours.
 
-The refinement weighs the pairs by their points' covariances. These are the pixels of both maps, propagated: the
-reprojections both ways are the same pixels again. So they judge the result, per keyframe and over all. In the
-refinement they would count twice.
+The refinement weighs the pairs by their points' covariances, which are the pixels of both maps, propagated. The
+reprojections both ways are the same pixels again: they judge the result, per keyframe and over all.
 """
 
 from __future__ import annotations
@@ -273,8 +272,7 @@ def _oldest_consensus(
 ) -> _Consensus | Failure:
     """Find the similarity of the oldest trusted keyframes: where two fit, the older one holds.
 
-    It is estimated on all trusted keyframes. While some of them disagree, it is estimated again on fewer, always with
-    the oldest among them, until all agree.
+    While some of the keyframes disagree, it is estimated again on fewer, always with the oldest among them.
     """
     ids = model.pairs.keyframes
     rows = np.flatnonzero(trusted)

@@ -1,17 +1,16 @@
 """From the overlap, where a link is measured, to the new map's live end: its scale, and the bend by a wrong camera.
 
 A wrong camera bends a map wherever it turns: it may agree with another map of that camera on all that both have seen,
-and say nothing of the scale beyond. How sure the pixels contradict the camera does not decide. Matches with common
-errors look like a wrong camera beyond their noise, although the map's shape hardly changes with it. A short map may
-hardly know its camera, and be bent. So the test compares the map with the one under the preferred camera. Both are
-solved from the same observations alone: other ties would count as an effect of the camera.
+and say nothing of the scale beyond. How sure the pixels contradict the camera does not decide, as matches with common
+errors do so too. The test compares the map with the one under the preferred camera. Both are solved from the same
+observations alone: other ties would count as an effect of the camera.
 
-Of that, chance has its share: pixels of an exact camera ask for another one, too. A correction at a squared distance of
-d2 makes a change of at most sqrt(d2) of that change's standard deviations, in any direction (Cauchy-Schwarz). So chance
-makes at least the part 1 / d2 of the change's square on average. The rest counts.
+Chance has its share: a correction at a squared distance of d2 makes a change of at most sqrt(d2) of that change's
+standard deviations, in any direction (Cauchy-Schwarz). So chance makes at least the part 1 / d2 of the change's square
+on average. The rest counts.
 
 A camera that was estimated is itself known to a covariance only. What the map changes under a camera that is one
-standard deviation off, in each independent direction, counts beside it. In a bend 1 % of focal length is 10 % of scale.
+standard deviation off, in each independent direction, counts beside it.
 """
 
 from __future__ import annotations

@@ -1,12 +1,11 @@
 """Motion test: whether a camera can have moved across a gap, or across the seam between two maps. It uses no pixels.
 
-On either side the maps give a velocity. The mean of the two, times the time between them, predicts the displacement.
-How far such predictions are off is measured in the run itself: the same question is asked over the same time wherever
-the camera was tracked without interruption. So no unit is needed, and a hand is judged as a hand, a car as a car.
+The mean of the velocities on either side, times the time between them, predicts the displacement. How far such
+predictions are off is measured in the run itself, over the same time, wherever the camera was tracked without
+interruption. So no unit is needed, and a hand is judged as a hand, a car as a car.
 
-A gap may be longer than the history that could be asked. The error then grows as that of a velocity that changes at
-random. The camera may also have stood still for the rest of the time: a robot that has never been seen to stop can stop
-all the same. In the end the test allows everything.
+If a gap is longer than the history, the error grows as that of a velocity that changes at random. The camera may also
+have stood still for the rest of the time. In the end the test allows everything.
 """
 
 from __future__ import annotations
@@ -95,9 +94,8 @@ def step_motions(path: Path, rows: IntArray, known: Path) -> Iterator[Motion]:
 def seam_motions(old: Path, new: Path, slack: Slack = lambda i, j: 0.0) -> Iterator[Motion]:
     """Measure the camera's motion wherever one of two maps follows on the other.
 
-    The usual error is the old map's, or the new one's where the old one is too short. The end of the old map may be
-    corrupted: a refused seam is measured once more without the old map's last frames. It is left out if only these
-    contradict it.
+    The usual error is the old map's, or the new one's where the old one is too short. A refused seam is measured once
+    more without the old map's last frames, which may be corrupted, and left out if only these contradict it.
 
     - `old`, `new`: of different frames, in the same coordinates.
     - `slack`: what the join leaves open between a frame of one map and one of the other, given by their indices.
@@ -122,8 +120,8 @@ def find_reached(path: Path, is_known: BoolArray, known: Path, sigma_mu: FloatAr
     """Return the frames (N,) of a path whose steps the camera can have made.
 
     Steps from or to a frame that is not known are measured. Beside a jump the frame that hangs more loosely on the
-    known ones is wrong. With it go those that follow, up to a known frame or the next jump. The last known frames
-    before a refused step may be corrupted, as in `seam_motions`.
+    known ones is wrong. So are those that follow, up to a known frame or the next jump. The last known frames before a
+    refused step may be corrupted, as in `seam_motions`.
 
     - `is_known` (N,): frames whose place is known.
     - `known`: the camera's path where the usual error is measured, in the unit of `path`.
@@ -204,9 +202,8 @@ def _measure(fits: _Fits, last_before: int, known: _Fits, slack_mu: float = 0.0)
 
 
 def _explained(off: FloatArray, before: FloatArray, after: FloatArray, over_s: float) -> tuple[float, float]:
-    """Return how far a change of velocity displaces a camera at most, and the part of an error that it leaves.
-
-    It displaces along the change. A camera that turns goes further, too, than the mean of its velocities leads.
+    """Return how far a change of velocity displaces a camera, along the change, at most; and the part of an error that
+    it leaves.
     """
     change = after - before
     along = change / max(float(np.linalg.norm(change)), 1e-300)

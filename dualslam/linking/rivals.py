@@ -1,7 +1,7 @@
 """Choice among several poses beyond a gap that the images all allow: the one that the camera can have reached.
 
-Repeated structure allows many poses, a period apart. The velocities before and after the gap, each known in its own
-map, predict the motion, as in any motion test (`linking/motion.py`). A pose is accepted only if they leave no doubt.
+The velocities before and after the gap, each known in its own map, predict the motion (`linking/motion.py`). A pose is
+accepted only if they leave no doubt.
 """
 
 from __future__ import annotations
@@ -32,10 +32,9 @@ class Choice:
 def choose_by_velocity(walked: Path, known: Path, rivals: Sequence[Rival]) -> Choice:
     """Choose by velocity between the poses of a walk beyond gaps and their alternatives.
 
-    The velocity before the gap is the lost map's: the walk may have found its place only a while beyond the gap, and a
-    long gap decides less. Of a frame's poses one is accepted if the motion test allows it and refuses all others. The
-    test must also refuse a further pose that was not found, as far off as these lie from each other. All frames must
-    agree.
+    The velocity before the gap is the lost map's. Of a frame's poses one is accepted if the motion test allows it and
+    refuses all others. It must also refuse a further pose that was not found, as far off as these lie from each other.
+    All frames must agree.
 
     - `walked`: of the frames of the walk and those that it set out from.
     - `known`: the lost map's, as far as it is sound, in the coordinates of the walk.

@@ -1,13 +1,11 @@
 """How firmly a map holds its scale from one place to another.
 
-A link is measured where two maps overlap; what it is made for lies elsewhere, at the new map's live end. Between the
-two places the scale is handed on from landmark to landmark. If few are shared, or all are seen under one angle, little
-of it arrives. How much is known of it stands in the normal equations of the map: all poses and points between the
-places are unknown together. The result is the ratio of the scales at which the cameras of either place see their
-points. That ratio does not depend on the gauge.
+A link is measured where two maps overlap, for the new map's live end. In between the scale is handed on from landmark
+to landmark. How much of it arrives stands in the normal equations of the map: all poses and points between the places
+are unknown together. The result is the ratio of the scales at which the cameras of either place see their points, which
+does not depend on the gauge.
 
-The same equations tell how well the size of the camera's path is known. It can be unsure where depths are firm: few
-landmarks, or a short way against their depth, fix how far the camera is from them, but not how far it has gone.
+The same equations tell how well the size of the camera's path is known. It can be unsure where depths are firm.
 """
 
 from __future__ import annotations
@@ -44,10 +42,8 @@ NO_TIE = 1e-7
 def scale_sigma_between(submap: Submap, here: IntArray, there: IntArray) -> float:
     """Return the standard deviation of the log of the scale at one place relative to another.
 
-    - `submap`: solved. Its keyframes from the first to the last of those given, and some around, count with what they
-      saw.
-    - `here`, `there`: keyframe ids of the two places, which may overlap; those that the submap does not hold are passed
-      over.
+    - `submap`: solved. Its keyframes between those given, and some around, count with what they saw.
+    - `here`, `there`: keyframe ids of the two places, which may overlap; unknown ones are passed over.
 
     Returns float: inflated as the links' own covariances are. Infinite where the places do not hang together, or one is
     empty.

@@ -1,7 +1,7 @@
 """A similarity tested by the shared keyframes one by one, in order of time.
 
 The newest part of the old map may be corrupted: rigid in itself, so that it fits the new map by a clean similarity that
-is wrong. What gives it away lies along time: the place where the old map is torn, or where the similarity changes.
+is wrong. Along time it shows where the old map is torn, or where the similarity changes.
 """
 
 from __future__ import annotations
@@ -72,10 +72,9 @@ def leading_run(agrees: BoolArray, max_misfits: int) -> int:
 def find_discontinuities(submap: Submap, oldest: int, newest: int) -> IntArray:
     """Return the ids of the keyframes before which a map is torn, ascending: its parts there are not held together.
 
-    A wrong pose either ends the tracks, or leaves their observations wrong on one side of it. So a place between two
-    keyframes is torn if too few landmarks are seen on both sides in agreement with their pixels. It is also torn if
-    most observations of landmarks followed across it disagree. These are seen twice on either side, since a single
-    camera cannot detect a change of scale about itself.
+    A place between two keyframes is torn if too few landmarks are seen on both sides in agreement with their pixels. It
+    is also torn if most observations of landmarks followed across it disagree. These are seen twice on either side,
+    since a single camera cannot detect a change of scale about itself.
 
     `oldest`, `newest`: keyframe ids; the places after `oldest` up to before `newest` are searched.
     """
@@ -101,11 +100,10 @@ def find_discontinuities(submap: Submap, oldest: int, newest: int) -> IntArray:
 def smallest_share_handed_on(submap: Submap, oldest: int, newest: int) -> float:
     """Return which share of what a map's keyframes see it hands on, at the place where that is least.
 
-    At a place between two keyframes, landmarks seen on both sides are counted, where they agree with their pixels. The
-    share is of what a keyframe sees there. Where an occluder comes in, most landmarks vanish at once. Its own replace
-    them before parallax fixes their depth, and the map stays in agreement with itself.
+    Landmarks seen on both sides of a place in agreement with their pixels count, of what a keyframe sees there. Where
+    an occluder comes in, its own landmarks replace most others before parallax fixes their depth.
 
-    `oldest`, `newest`: keyframe ids; the places after `oldest` up to before `newest` are searched.
+    `oldest`, `newest`: as for `find_discontinuities`.
     """
     ids, places = _windows(submap, oldest, newest)
     _, good = _own_agreement(submap, ids, PIXEL_CHI2)

@@ -47,13 +47,10 @@ class FaissRecogniser:
     """Remembers the landmarks of all submaps by their descriptors, and says which keyframes an image resembles.
 
     It proposes and proves nothing: what it finds goes through `dualslam.places.verification`. The same calls in the
-    same order give the same candidates.
-
-    Descriptors of 256 bits go into the cells that are shipped. Others, and vectors of numbers, are searched
+    same order give the same candidates. Descriptors of 256 bits go into the cells that are shipped; others are searched
     exhaustively.
 
-    - `distance`: between paired descriptors, as the front end measures it (`Frontend.distance`): a count of differing
-      bits, or the norm of the difference.
+    - `distance`: between paired descriptors, as the front end measures it (`Frontend.distance`).
     - `max_distance`: between two views of one point (`Frontend.max_distance_strict`).
     """
 

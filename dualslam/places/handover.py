@@ -1,8 +1,4 @@
-"""Continue a run in the joined map of an earlier run, once the live map reaches its place.
-
-Without it each run would map the place once more, from the seam between two submaps on. A map would grow by a submap
-with each use.
-"""
+"""Continue a run in the joined map of an earlier run, once the live map reaches its place."""
 
 from __future__ import annotations
 
@@ -39,9 +35,8 @@ class Handover:
 
         - `track`: of the frame, in the live map.
         - `K` (3, 3): intrinsics of the frame.
-        - `in_parts`: each call asks the index, or poses the frame by one of up to three keyframes that it has named.
-          The keyframe waits meanwhile. For real time, where all at once takes longer than a frame (median 36 ms, up to
-          70, in a map of 7-Scenes). The caller adds the submaps to the index.
+        - `in_parts`: for real time: each call asks the index, or poses the frame by one of up to three keyframes that
+          it has named, and the keyframe waits meanwhile. The caller adds the submaps to the index.
         """
         self._forget_another(live)
         if self._sighting is None and self._search is not None:
@@ -103,11 +98,7 @@ class Handover:
         return found
 
     def follow_alone(self, view: View, live: VisualOdometry) -> Relocalised | None:
-        """Show a frame that the live map could not pose to the submap that seems to have the place.
-
-        It had the place by a frame that both posed alike, and by each frame since: the map that ends here was about to
-        switch to it.
-        """
+        """Show a frame that the live map could not pose to the submap that both posed alike so far."""
         self._forget_another(live)
         if self._sighting is None:
             return None

@@ -45,9 +45,9 @@ def contradict(atlas: Atlas, one: PlaceMatch, other: PlaceMatch) -> bool:
 def plausible(record: Record, match: PlaceMatch) -> PlaceMatch | Failure:
     """Refuse a place that no drift explains: the map that leads to it cannot have lost that much.
 
-    These are the bounds of what drift can be at all, and not of what the chain says of its own: pixels that prove
-    the place are believed over any chi-square. A street of identical houses is refused here. Each house is a large part
-    of the way off from the next, and yet neither turned nor of another size.
+    These are the bounds of what drift can be at all: pixels that prove the place are believed over any chi-square. In a
+    street of identical houses each is a large part of the way off from the next, and neither turned nor of another
+    size.
     """
     (a, k_a), (b, k_b) = match.place, match.query
     atlas = record.atlas

@@ -1,16 +1,13 @@
 """The frames that reverse tracking can still read: features and grey images, in both directions of time.
 
-Of frames that came too late to be tracked it has the image alone. Only reverse tracking asks for these.
-
-K = k + k_r frames: the last k while all is well, and all that came since while the live submap is lost. Memory has a
-hard bound, which k frames and a short loss stay far below. A long loss (a lens that stays covered) reaches it, and then
-the frames of the loss give way, not those before it: a recovery needs the k frames before the loss, which the old map
-saw, and the newest, with which the new map starts. It skips unusable frames between. In order:
+K = k + k_r frames: the last k while all is well, and all that came since while the live submap is lost. Of frames that
+came too late to be tracked it has the image alone. Memory has a hard bound. A long loss reaches it, and then the frames
+of the loss give way: a recovery needs the k frames before it, which the old map saw, and the newest, with which the new
+map starts. In order:
 
 1. frames that came too late are dropped, the oldest first;
 2. images are packed (`GreyImage.pack`), the oldest first: nothing is lost but time;
-3. images of the stretch are dropped, each time the one whose neighbours stay closest together. The rest thins out
-   evenly, and reverse tracking takes longer, but even, steps;
+3. images of the stretch are dropped, each time the one whose neighbours stay closest together;
 4. then whole frames of the stretch, in the same way;
 5. where the bound does not even hold the rest, the oldest images, and at last the oldest frames.
 """

@@ -28,10 +28,8 @@ def fuse(
 ) -> bool:
     """Join the two submaps by the link, unless the atlas refuses it; return whether they are joined.
 
-    Frames of the old map's end take their pose from the new one.
-
-    The link was measured between a copy of the old submap and the new one at the end of the walk. Both may have
-    moved since, and the link with them.
+    The link was measured between a copy of the old submap and the new one at the end of the walk. Both may have moved
+    since. Frames of the old map's end take their pose from the new one.
     """
     new_id = job.submap.id
     joined = _current(record, job.lost[found.old_id], new_id, found, S_now_then)
@@ -96,9 +94,8 @@ def _note_link(
 def gauge_at_overlap(submap: Submap, keyframe_ids: IntArray) -> tuple[int, int]:
     """Return the two keyframes that are to hold a submap's gauge from now on: the widest baseline of the overlap.
 
-    A link is measured at its overlap. While the map grows at its other end, its scale is still solved for. If the gauge
-    lay there, the overlap would drift away under the link. Where the overlap spans less than the gauge in use (a turn
-    in place), that one stays.
+    A link is measured at its overlap, which would drift away under it if the gauge lay elsewhere. Where the overlap
+    spans less than the gauge in use (a turn in place), that one stays.
     """
     ids = [int(k) for k in keyframe_ids if int(k) in submap.keyframes]
     if len(ids) < 2:

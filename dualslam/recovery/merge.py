@@ -1,11 +1,10 @@
 """Merging of reverse tracking's additions to a snapshot into the submap as it has become meanwhile.
 
 Three states of one submap: the snapshot (`base`), the snapshot with what the walk added (`grown`), and the submap that
-went on (`live`): it may have grown at its other end, been solved again, changed its camera, or been archived. Landmark
-ids only grow, so that all which is older than the snapshot has the same ids in all three. Rows of observations keep
-theirs from the snapshot to the grown one. In the live submap they may have new numbers, and are identified by three
-things: a keyframe, its feature, a landmark. What the walk added are observations; its poses and points are initial
-values for the next solution, no more.
+went on (`live`). That one may have been solved again, changed its camera, or been archived. Landmarks older than the
+snapshot have the same ids in all three. Rows of observations keep theirs from the snapshot to the grown one; in the
+live submap they are identified by keyframe, feature and landmark. What the walk added are observations; its poses and
+points are initial values for the next solution.
 """
 
 from __future__ import annotations
@@ -88,8 +87,7 @@ def _remove_rejected(merged: Submap, base: Submap, moved: Submap) -> None:
 def _identify(merged: Submap, base: Submap, moved: Submap) -> IntArray:
     """Return for each landmark of the walk the one that it is in the merged submap, if that is known already.
 
-    Older than the snapshot: the same, and where the walk found two of them to be one, they become one. Newer: one that
-    holds a feature which the live submap has given a landmark meanwhile is that landmark.
+    An older one than the snapshot is the same. A newer one is that which the live submap has given one of its features.
     """
     n = len(base.landmarks)
     id_of = np.full(len(moved.landmarks), NO_LANDMARK, np.int64)

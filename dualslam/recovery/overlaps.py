@@ -1,8 +1,7 @@
 """Links between maps of one set that hold the same keyframes, though other places have joined them.
 
-Reverse tracking refuses a link that hands the scale on too loosely to the live end. It is measured well all the same.
-If a place joins the two maps elsewhere, their overlap closes a cycle. Then the atlas can tell where on the way a map is
-bent: where it claims to know its scale least.
+Reverse tracking refuses a link that hands the scale on too loosely to the live end. If a place joins the two maps
+elsewhere, their overlap closes a cycle. By it the atlas can tell where on the way a map is bent.
 """
 
 from __future__ import annotations

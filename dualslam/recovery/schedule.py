@@ -71,10 +71,9 @@ class LinkTries:
 class RetrySchedule:
     """Knows of each submap whose walk has left something to find when the next walk is due.
 
-    That is when the submap has grown at its live end, or its camera has been calibrated: it knows depths better then,
-    and more of what there is to see. A walk whose link its own pixels refuse, as they contradict the camera, waits for
-    another camera: in two clips, five that were made after mere growth were refused so again, and three after the
-    calibration were linked. So does one that held all keyframes of the lost maps, and these left the scale open.
+    That is when the submap has grown at its live end, or its camera has been calibrated. A walk whose link its own
+    pixels refuse, as they contradict the camera, waits for another camera: growth alone links none. So does one that
+    held all keyframes of the lost maps, and these left the scale open.
 
     `keyframes`: live keyframes at which a walk is made again, see `RecoveryConfig.retry_keyframes`.
     """
@@ -99,7 +98,7 @@ class RetrySchedule:
         """Note that a walk which knew so many live keyframes, and this camera, has left something to find.
 
         `needs_camera`: no later one does better under this camera. `stopped_at`: the frame at which it stopped, before
-        it met a lost map. If the one before it stopped there too, growth changes nothing, not even at the end.
+        it met a lost map. If the one before it stopped there too, growth changes nothing.
         """
         is_stuck = stopped_at is not None and stopped_at == self._stopped_at.get(submap_id)
         self._stopped_at[submap_id] = stopped_at

@@ -110,10 +110,7 @@ def _agrees(log_focal: float, sigma: float) -> bool:
 
 
 def in_size_of_map(sequence: Sequence, saved_map: str | Path) -> Sequence:
-    """Return a sequence with its images in the size of a saved map's, where they are of the same shape.
-
-    Descriptors know the scale of what they describe, so that few are found again in images of half the size.
-    """
+    """Return a sequence with its images in the size of a saved map's, where they are of the same shape."""
     known = load_camera(saved_map)
     if known is None:
         return sequence

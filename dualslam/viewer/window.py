@@ -27,8 +27,8 @@ def has_display() -> bool:
 def open_viewer(recording: bytes) -> None:
     """Show the content of an ``.rrd`` file, and wait until the window is closed.
 
-    The viewer sends usage data, and asks for newer versions, unless its settings forbid it. Its own settings forbid the
-    former, so that the user's stay unchanged. A proxy that leads nowhere stops the latter.
+    The viewer's own settings forbid it to send usage data; a proxy that leads nowhere keeps it from asking for newer
+    versions.
 
     Raises `OutputError` if the viewer cannot be started.
     """

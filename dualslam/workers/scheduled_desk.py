@@ -1,9 +1,8 @@
 """The desk of a system: jobs are done by an executor, and their answers are given out as a schedule says.
 
 An executor does the work, in this process (`InlineDesk`) or in others (`WorkerDesk`), and knows nothing of frames. The
-schedule (`dualslam/core/schedule.py`) says in which frame an answer is used: with the same one a run takes the same
-way whichever executor does the work. In real time nothing is waited for: answers are used in the first frame that
-begins after they are there, and recorded.
+schedule (`dualslam/core/schedule.py`) says in which frame an answer is used, whichever executor does the work. In real
+time answers are used in the first frame that begins after they are there, and recorded.
 """
 
 from __future__ import annotations

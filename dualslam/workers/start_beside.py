@@ -118,10 +118,10 @@ log = logging.getLogger(__name__)
 
 
 class FeaturesBeside:
-    """Has the features of one frame after the other found in another process.
+    """Has the features of one frame after the other found in another process, called on one thread that is not the
+    tracking's.
 
-    Called on one thread that is not the tracking's. A process that has died or hangs costs nothing but time: the frame
-    comes back without features, and the tracking process finds them. So do all that follow where no process starts.
+    From a process that has died or hangs, the frame comes back without features, and the tracking process finds them.
 
     - `desk`: with a lane for features.
     - `painted`: returns a frame as the front end is to see it.

@@ -1,14 +1,11 @@
 """Objects of numpy arrays through a pipe: large arrays go past the pickle, and what was sent before is not sent again.
 
-Pickling holds the interpreter's lock, and so does each turn at a pipe: a thread that carries a job of a thousand arrays
-must come to its turn a thousand times beside the one that tracks. So only the structure is pickled. The memory of large
-arrays is written from its place. Many pieces go with one system call, which holds no lock.
+Pickling holds the interpreter's lock, and so does each turn at a pipe. So only the structure is pickled. The memory of
+large arrays is written from its place, many pieces with one system call, which holds no lock.
 
-Features and images never change, and most of a job is made of those that the one before held already: the frames in the
-buffer, the keyframes of a map. Each goes through a `Channel` once. The worker keeps it as long as the tracking process
-does. The result only names it, and so holds the changes alone. An object stays the same object in the worker, job after
-job: what was found in an image is known when it comes again. The other way nothing is kept: what a worker has made is
-whole in its result.
+Features and images never change, and most of a job is made of those that the one before held already. Each goes through
+a `Channel` once, and the worker keeps it as long as the tracking process does. An object stays the same object in the
+worker, job after job. The other way nothing is kept: what a worker has made is whole in its result.
 """
 
 from __future__ import annotations

@@ -322,8 +322,7 @@ class CalibrationConfig(StrictModel):
     def max_focal_sigma(self) -> float:
         """Sigma of the log focal length up to which it counts as observed: a fifth of its prior's.
 
-        In a right-angled bend 1 % of focal length costs 10 % of scale and more. There half as sure an answer does more
-        harm than good (a car driving backwards round a bend: 6 % off, with a sigma of 1.3 %).
+        In a right-angled bend 1 % of focal length costs 10 % of scale and more.
         """
         return 0.2 * self.log_focal_sigma
 

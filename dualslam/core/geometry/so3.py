@@ -56,12 +56,7 @@ def safe_angle(omega: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def hat(omega: ArrayLike) -> FloatArray:
-    """Return the skew-symmetric matrix of a vector: ``hat(a) @ b == cross(a, b)``.
-
-    `omega` (..., 3).
-
-    Returns (..., 3, 3) float64.
-    """
+    """Return the skew-symmetric matrix of a vector, (..., 3) -> (..., 3, 3): ``hat(a) @ b == cross(a, b)``."""
     w = np.asarray(omega, np.float64)
     out = np.zeros((*w.shape, 3))
     out[..., 0, 1], out[..., 0, 2], out[..., 1, 2] = -w[..., 2], w[..., 1], -w[..., 0]
@@ -70,12 +65,7 @@ def hat(omega: ArrayLike) -> FloatArray:
 
 
 def exp(omega: ArrayLike) -> FloatArray:
-    """Return the rotation matrix of a rotation vector (Rodrigues' formula).
-
-    `omega` (..., 3): axis times angle, radians.
-
-    Returns (..., 3, 3) float64.
-    """
+    """Return the rotation matrix (..., 3, 3) of a rotation vector (..., 3), radians (Rodrigues' formula)."""
     w = np.asarray(omega, np.float64)
     theta = np.sqrt((w * w).sum(-1))[..., None, None]
     W = hat(w)
@@ -85,11 +75,9 @@ def exp(omega: ArrayLike) -> FloatArray:
 
 
 def log(R: ArrayLike) -> FloatArray:
-    """Return the rotation vector of a rotation matrix, its norm in [0, pi]; by way of the quaternion, so safe near pi.
+    """Return the rotation vector (..., 3), radians, of a rotation matrix (..., 3, 3), its norm in [0, pi].
 
-    `R` (..., 3, 3).
-
-    Returns (..., 3) float64, radians.
+    It goes by way of the quaternion, so it is safe near pi.
     """
     q = quat_xyzw_from_matrix(R)
     v, w = q[..., :3], q[..., 3]
@@ -160,14 +148,11 @@ def rotation_angle(R: ArrayLike) -> FloatArray:
 
 
 def quat_xyzw_from_matrix(R: ArrayLike) -> FloatArray:
-    """Return unit quaternions (x, y, z, w) with w >= 0 (and, where w is 0, the first non-zero of x, y, z positive).
+    """Return unit quaternions (..., 4) of matrices (..., 3, 3), w >= 0 (where w is 0, the first non-zero of x, y, z >
+    0).
 
     Bar-Itzhack's symmetric products: every row of 4 q q' is linear in R; the row of largest norm is free of
     cancellation. (S. Shepperd, "Quaternion from rotation matrix", 1978, without its branches.)
-
-    `R` (..., 3, 3).
-
-    Returns (..., 4) float64.
     """
     m = np.asarray(R, np.float64)
     if m.ndim == 2:
