@@ -12,7 +12,7 @@ import numpy as np
 from dualslam.atlas.stored_map import StoredMap
 from dualslam.atlas.tidying import tidy
 from dualslam.backend.final_refinement import refine_submap, settle_ties
-from dualslam.backend.registration_bundle import adjust_and_prune
+from dualslam.backend.local_ba import adjust_and_prune
 from dualslam.build.checks import check_config, check_given
 from dualslam.build.parts import atlas_solver, graph_maker, new_calibration, new_initialiser, place_parts, window_solver
 from dualslam.build.walks import recovery_parts

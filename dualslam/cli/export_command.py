@@ -22,8 +22,7 @@ from dualslam.io.export.exported_map import ExportedMap, flatten, read_stored, w
 from dualslam.io.export.formats import FORMATS
 from dualslam.io.export.images import mask_of, undistorted, with_images
 from dualslam.io.export.mcap import write_mcap
-from dualslam.io.export.metric import by_distance
-from dualslam.io.metric_scale import read_scale
+from dualslam.io.export.metric import by_distance, read_scale
 from dualslam.io.run_folder import MAP, TRAJECTORY, TRAJECTORY_KITTI
 from dualslam.io.run_reading import read_numbers, read_summary
 from dualslam.io.sequence import RecordedSequence

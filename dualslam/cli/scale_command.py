@@ -8,8 +8,7 @@ from contextlib import suppress
 from dualslam.core.errors import InputError
 from dualslam.io.colours import load_pictures
 from dualslam.io.export.exported_map import flatten, read_stored, with_frames
-from dualslam.io.export.metric import MetricScale, by_distance, by_height, by_marker
-from dualslam.io.metric_scale import read_scale, write_scale
+from dualslam.io.export.metric import MetricScale, by_distance, by_height, by_marker, read_scale, write_scale
 from dualslam.io.run_folder import MAP
 from dualslam.io.run_reading import read_numbers, read_summary
 from dualslam.run.sources import open_images_of_run

@@ -30,7 +30,7 @@ from dualslam.linking.correspondences import (
     place_pairs,
 )
 from dualslam.linking.deformation import deformation_covariance, measure_deformation
-from dualslam.linking.gates import (
+from dualslam.linking.join_test import (
     LOOK_BACK,
     MAX_HYPOTHESES,
     MAX_MISFITS,

@@ -23,7 +23,7 @@ from dualslam.core.geometry.alignment import COVARIANCE_INFLATION
 from dualslam.core.geometry.projection import project_points, projection_jacobians
 from dualslam.core.noise_model import GROUP
 from dualslam.core.types import FloatArray, IntArray
-from dualslam.linking.gates import PIXEL_CHI2
+from dualslam.linking.join_test import PIXEL_CHI2
 from dualslam.map.submap import Submap
 
 N_AROUND = 2 * GROUP

@@ -14,7 +14,7 @@ from dualslam.core.config.settings import LinkingConfig
 from dualslam.core.geometry import se3, sim3, so3
 from dualslam.core.noise_model import GATE_SIGMAS, GROUP, MAJORITY
 from dualslam.core.types import BoolArray, FloatArray, IntArray
-from dualslam.linking.gates import MIN_PAIRS_PER_KEYFRAME, MIN_TIES, PAIR_CHI2, PIXEL_CHI2
+from dualslam.linking.join_test import MIN_PAIRS_PER_KEYFRAME, MIN_TIES, PAIR_CHI2, PIXEL_CHI2
 from dualslam.linking.pairs import PairModel, pixel_chi2
 from dualslam.map.submap import Submap
 

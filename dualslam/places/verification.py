@@ -26,8 +26,18 @@ from dualslam.core.geometry.alignment import Sim3Estimate, estimate_sim3_robust
 from dualslam.core.noise_model import MAJORITY, MIN_CONSENSUS, PROOF_VIEWS
 from dualslam.core.place_matcher import PlaceMatcher, Sighting
 from dualslam.core.types import Failure, FailureReason, Features, FloatArray, IntArray
-from dualslam.linking.gates import MAX_HYPOTHESES, MAX_SCALE, MIN_IMAGE_SPREAD, MIN_PAIRS_PER_KEYFRAME, PAIR_CHI2
-from dualslam.linking.join_test import JoinGate, LinkEvidence, ambiguity_gate, similarity_gates, support_gate
+from dualslam.linking.join_test import (
+    MAX_HYPOTHESES,
+    MAX_SCALE,
+    MIN_IMAGE_SPREAD,
+    MIN_PAIRS_PER_KEYFRAME,
+    PAIR_CHI2,
+    JoinGate,
+    LinkEvidence,
+    ambiguity_gate,
+    similarity_gates,
+    support_gate,
+)
 from dualslam.map.landmark_views import landmark_covariances
 from dualslam.map.submap import Submap
 from dualslam.places.sides import (

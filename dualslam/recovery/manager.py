@@ -28,9 +28,8 @@ from dualslam.map.solving import solve
 from dualslam.map.split import sound_copy
 from dualslam.map.submap import Submap
 from dualslam.map.submap_change import change_of_frame
-from dualslam.recovery.bypass import pose_frames
 from dualslam.recovery.frame_buffer import FrameBuffer
-from dualslam.recovery.fusion import fuse, gauge_at_overlap, note_refused, tighten
+from dualslam.recovery.fusion import fuse, gauge_at_overlap, note_refused, pose_frames, tighten
 from dualslam.recovery.job import FoundLink, RecoveryJob, RecoveryResult, path_of
 from dualslam.recovery.merge import merge_recovery
 from dualslam.recovery.schedule import LinkTries, RetrySchedule, as_far_as_it_leads, way_to_gaps

@@ -21,9 +21,9 @@ from dualslam.core.errors import InputError, SolverError
 from dualslam.core.metric_problem import MeasurementSource, MetricSolution, RowSource
 from dualslam.core.trajectory import Trajectory
 from dualslam.core.types import FloatArray
+from dualslam.io.export.metric import write_scale
 from dualslam.io.measurements import read_measurements
 from dualslam.io.metric_files import write_covariances, write_metric
-from dualslam.io.metric_scale import write_scale
 
 log = logging.getLogger(__name__)
 

@@ -17,7 +17,7 @@ from dualslam.core.types import Failure, FailureReason, View
 from dualslam.map.split import next_submap, submap_of
 from dualslam.map.submap import Submap
 from dualslam.places.sightings import Sightings
-from dualslam.recovery.bypass import drop_corrupted
+from dualslam.recovery.fusion import drop_corrupted
 from dualslam.recovery.manager import Recoveries
 from dualslam.recovery.scale_parts import part_what_lost_its_scale
 from dualslam.recovery.scale_watch import ScaleLoss, ScaleWatch

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from dualslam.core.camera.base import Camera
 from dualslam.core.types import FloatArray, FrameStatus, IntArray
 from dualslam.io.colours import GREY, load_pictures
-from dualslam.io.metric_scale import read_scale
+from dualslam.io.export.metric import read_scale
 from dualslam.io.run_folder import MAP, FrameRow
 from dualslam.report.canvas import nice_step, units_of_map
 from dualslam.report.markup import Markup, join, number, tag

@@ -23,7 +23,7 @@ from dualslam.frontends.direct.warp import (
     sample,
     warp_points,
 )
-from dualslam.frontends.tracking.row_shifts import find_as_read
+from dualslam.frontends.tracking.turning import find_as_read
 from dualslam.map.submap import NO_LANDMARK, Submap
 
 SPACING_PX = 2.0

@@ -7,7 +7,7 @@ import numpy as np
 from dualslam.core.camera.base import Camera, rectified_sigma
 from dualslam.core.interfaces import Frontend
 from dualslam.core.types import Features, FloatArray, IntArray
-from dualslam.frontends.tracking.row_shifts import straighten
+from dualslam.frontends.tracking.turning import straighten
 
 
 def features_found(

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 
@@ -20,7 +19,7 @@ from dualslam.core.interfaces import Frontend
 from dualslam.core.noise_model import MAX_DEPTH_SIGMA
 from dualslam.core.types import BoolArray, Failure, FailureReason, Features, FloatArray, IntArray, Matches, View
 from dualslam.frontends.features.image_features import ImageFeatures
-from dualslam.frontends.tracking.row_shifts import correct_shutter
+from dualslam.frontends.tracking.turning import correct_shutter
 from dualslam.map.submap import Submap
 
 NO_TRACK = -1
@@ -150,28 +149,8 @@ def triangulate(views: TrackViews, K: FloatArray) -> tuple[FloatArray, BoolArray
     return xyz, good
 
 
-class AuxiliaryFeatures(Protocol):
-    """A front end's rectified features of views."""
-
-    def of(self, view: View) -> Features | Failure:
-        """Return the features of a view; a failure where they cannot be found any more."""
-        ...
-
-    def prefetch(self, views: Iterable[View]) -> None:
-        """Say which views will be asked for next, in this order: their features may be found beforehand."""
-        ...
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Auxiliary:
-    """A front end that poses frames, and where its features come from."""
-
-    frontend: Frontend
-    features: AuxiliaryFeatures
-
-
 class OwnFeatures:
-    """Those that the live front end has found: it is its own auxiliary front end. Implements `AuxiliaryFeatures`."""
+    """Those that the live front end has found: it is its own auxiliary front end."""
 
     def of(self, view: View) -> Features | Failure:
         """Return the view's own features."""
@@ -182,7 +161,7 @@ class OwnFeatures:
 
 
 class BufferedFeatures:
-    """Features that another front end finds in the buffered images. Implements `AuxiliaryFeatures`."""
+    """Features that another front end finds in the buffered images."""
 
     def __init__(self, images: ImageFeatures, model_sigma_px: float, camera: Camera) -> None:
         self._images = images
@@ -197,5 +176,13 @@ class BufferedFeatures:
         return features if view.turn_rad is None else correct_shutter(features, self._camera, view.turn_rad)
 
     def prefetch(self, views: Iterable[View]) -> None:
-        """Say which views will be asked for next."""
+        """Say which views will be asked for next, in this order: their features may be found beforehand."""
         self._images.prefetch(view.image for view in views if view.image is not None)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Auxiliary:
+    """A front end that poses frames, and where its features come from."""
+
+    frontend: Frontend
+    features: OwnFeatures | BufferedFeatures

@@ -28,7 +28,7 @@ from dualslam.frontends.direct.warp import Pyramid, build_pyramid, warp_points
 from dualslam.frontends.features.found_features import features_found
 from dualslam.frontends.gap.uncertainty import track_uncertainty
 from dualslam.frontends.tracking.keyframe_images import RIM_KEYFRAMES, KeyframeImages
-from dualslam.frontends.tracking.row_shifts import find_as_read
+from dualslam.frontends.tracking.turning import find_as_read
 from dualslam.map.landmark_views import landmark_covariances
 from dualslam.map.submap import Submap
 

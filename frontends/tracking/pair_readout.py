@@ -14,7 +14,7 @@ from dualslam.core.noise_model import GATE_SIGMAS, INFLATION, TINY
 from dualslam.core.types import Features, FloatArray, View
 from dualslam.frontends.tracking.focal_search import MIN_MATCHES
 from dualslam.frontends.tracking.resection import poselib_camera
-from dualslam.frontends.tracking.row_shifts import at_mid_row
+from dualslam.frontends.tracking.turning import at_mid_row
 
 READOUT_EVIDENCE = (GATE_SIGMAS * INFLATION) ** 2
 """Chi-square by which a rolling shutter must explain frames better than a global one, or a global one better than 0.02

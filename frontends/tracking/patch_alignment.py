@@ -27,7 +27,7 @@ from dualslam.frontends.direct.warp import (
     warp_points,
 )
 from dualslam.frontends.tracking.keyframe_images import KeyframeImages
-from dualslam.frontends.tracking.row_shifts import find_as_read
+from dualslam.frontends.tracking.turning import find_as_read
 from dualslam.map.submap import Submap
 
 N_ITERATIONS = 4

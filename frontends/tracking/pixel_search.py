@@ -19,7 +19,7 @@ from dualslam.core.pixels import PixelMatches, PosedImage
 from dualslam.core.types import Failure, Features, FloatArray, FrameMethod, IntArray, Track, View
 from dualslam.frontends.features.found_features import features_found
 from dualslam.frontends.tracking.keyframe_images import KeyframeImages
-from dualslam.frontends.tracking.row_shifts import find_as_read
+from dualslam.frontends.tracking.turning import find_as_read
 from dualslam.map.submap import NO_LANDMARK, Submap
 
 N_KEYFRAMES = 4

@@ -18,8 +18,7 @@ from dualslam.core.noise_model import MISSING_INTERVALS
 from dualslam.core.types import Failure, Features, FloatArray, View
 from dualslam.frontends.tracking.map_readout import ReadoutQuestion, ask_readout
 from dualslam.frontends.tracking.pair_readout import READOUT_EVIDENCE, ReadoutEstimator, is_fast
-from dualslam.frontends.tracking.row_shifts import correct_shutter
-from dualslam.frontends.tracking.turning import turn_between
+from dualslam.frontends.tracking.turning import correct_shutter, turn_between
 from dualslam.map.submap import Submap
 
 MIN_CHANGE_S = 0.002

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 import dualslam
-from dualslam.backend import ISam2SubmapGraph
+from dualslam.backend.submap_graph import ISam2SubmapGraph
 from dualslam.core.config.settings import GraphConfig
 from dualslam.testing.graph_scene import guessed_submap, make_scene, pose_errors
 

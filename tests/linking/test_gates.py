@@ -11,8 +11,9 @@ from dualslam.core.geometry import se3, sim3
 from dualslam.core.types import FailureReason, FloatArray
 from dualslam.linking import propose_correspondences, verify
 from dualslam.linking.deformation import measure_deformation
-from dualslam.linking.gates import PAIR_CHI2, PIXEL_CHI2
 from dualslam.linking.join_test import (
+    PAIR_CHI2,
+    PIXEL_CHI2,
     JoinGate,
     LinkEvidence,
     ambiguity_gate,

@@ -21,8 +21,7 @@ from dualslam.linking import (
 )
 from dualslam.linking.correspondences import propose_correspondences
 from dualslam.linking.estimate import LinkRefusal
-from dualslam.linking.gates import MIN_TIES, MINORITY_DEFORMATION
-from dualslam.linking.join_test import LinkEvidence
+from dualslam.linking.join_test import MIN_TIES, MINORITY_DEFORMATION, LinkEvidence
 from dualslam.linking.pairs import PairModel
 from dualslam.linking.scale_observability import (
     position_sigmas,

@@ -17,8 +17,8 @@ from dualslam.core.types import Failure, FailureReason, FloatArray, FrameStatus,
 from dualslam.map.frame_records import FrameRow
 from dualslam.map.submap import Submap
 from dualslam.places.plausibility import reachable
-from dualslam.recovery.bypass import drop_corrupted
 from dualslam.recovery.frame_buffer import FrameBuffer
+from dualslam.recovery.fusion import drop_corrupted
 from dualslam.recovery.job import RecoveryJob
 from dualslam.recovery.manager import Recoveries
 from dualslam.system.motion_watch import MotionWatch

@@ -14,7 +14,7 @@ from dualslam.map.frame_observations import FrameObservations
 from dualslam.map.frame_records import FrameRow
 from dualslam.map.split import submap_of
 from dualslam.map.submap import NO_LANDMARK, Submap
-from dualslam.recovery.bypass import pose_frames
+from dualslam.recovery.fusion import pose_frames
 from dualslam.recovery.job import RecoveredFrame
 from dualslam.recovery.merge import Merged, merge_recovery
 from dualslam.testing.graph_scene import guessed_submap, make_scene

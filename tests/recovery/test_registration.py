@@ -7,7 +7,7 @@ from functools import partial
 
 import numpy as np
 
-from dualslam.backend.registration_bundle import adjust_and_prune, parallax_rad
+from dualslam.backend.local_ba import adjust_and_prune, parallax_rad
 from dualslam.core.config.settings import Config
 from dualslam.core.geometry import se3, so3
 from dualslam.core.types import FloatArray, Keyframe

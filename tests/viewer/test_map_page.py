@@ -16,9 +16,9 @@ import pytest
 
 from dualslam.core.types import FloatArray
 from dualslam.io.colours import save_colours, save_pictures
+from dualslam.io.export.metric import write_scale
 from dualslam.io.map_files import load_arrays
 from dualslam.io.map_store import load_atlas, submap_path
-from dualslam.io.metric_scale import write_scale
 from dualslam.io.run_folder import MAP
 from dualslam.report import RunData, report_page
 from dualslam.viewer.colours import STATUS_COLOURS, rgb

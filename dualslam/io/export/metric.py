@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -12,8 +14,10 @@ from dualslam.core.camera.base import Camera
 from dualslam.core.errors import InputError
 from dualslam.core.geometry import se3
 from dualslam.core.types import FloatArray, Frame
+from dualslam.io.atomic import write_text
 from dualslam.io.export.exported_map import ExportedMap
 from dualslam.io.export.images import undistorted
+from dualslam.io.run_folder import MAP
 
 MAX_TILT_DEG = 15.0
 """Of the ground against the image's rows: a camera that is mounted level, on a road that may slope."""
@@ -202,3 +206,34 @@ def _triangulate(exported: ExportedMap, seen: list[tuple[int, FloatArray]]) -> F
         A += across
         b += across @ T[:3, 3]
     return np.asarray(np.linalg.solve(A, b), np.float64)
+
+
+SCALE = "scale.json"
+
+
+def write_scale(run: Path, metres_per_unit: float, sigma_rel: float | None, words: str) -> None:
+    """Keep the scale of a run's map.
+
+    - `run`: run folder with a map.
+    - `sigma_rel`: of it, relative.
+    - `words`: what it is from.
+    """
+    content = {"metres_per_unit": metres_per_unit, "sigma_rel": sigma_rel, "from": words}
+    write_text(run / MAP / SCALE, json.dumps(content, indent=1) + "\n")
+
+
+def read_scale(run: Path) -> float | None:
+    """Return the metres per unit of a run's map, or None if unknown.
+
+    Raises `InputError` if the file is damaged.
+    """
+    path = run / MAP / SCALE
+    if not path.is_file():
+        return None
+    try:
+        metres = float(json.loads(path.read_text())["metres_per_unit"])
+    except (ValueError, KeyError, TypeError) as error:
+        raise InputError(f"{path} is damaged; run dualslam scale again.") from error
+    if not metres > 0:
+        raise InputError(f"{path} says that a unit is {metres:g} m long; run dualslam scale again.")
+    return metres

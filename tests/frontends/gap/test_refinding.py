@@ -17,7 +17,7 @@ from dualslam.core.types import FloatArray, Keyframe, Track, View
 from dualslam.frontends.features.orb import OrbFrontend
 from dualslam.frontends.gap import refinding
 from dualslam.frontends.gap.refinding import FAR_KEYFRAMES, Refinder
-from dualslam.frontends.tracking.row_shifts import straighten
+from dualslam.frontends.tracking.turning import straighten
 from dualslam.lab.synthetic import SyntheticSequence, make_sequence
 from dualslam.map.submap import NO_LANDMARK, Submap
 

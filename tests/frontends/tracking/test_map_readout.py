@@ -18,7 +18,7 @@ from dualslam.core.noise_model import GATE_SIGMAS, INFLATION
 from dualslam.core.types import Failure, Features, FloatArray, Frame, IntArray, Keyframe, Track, View
 from dualslam.frontends.tracking.map_readout import MIN_KEYFRAMES, ReadoutQuestion, answer_readout, ask_readout
 from dualslam.frontends.tracking.rolling_shutter import TurnMeter
-from dualslam.frontends.tracking.row_shifts import correct_shutter, find_as_read, straighten
+from dualslam.frontends.tracking.turning import correct_shutter, find_as_read, straighten
 from dualslam.frontends.tracking.visual import VisualFrontEnd
 from dualslam.map.submap import Submap
 from dualslam.system.camera import shutter_watch

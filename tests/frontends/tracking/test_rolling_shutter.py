@@ -14,8 +14,7 @@ from dualslam.core.types import FloatArray, Frame, View
 from dualslam.frontends.features.orb import OrbFrontend
 from dualslam.frontends.tracking.pair_readout import READOUT_EVIDENCE, READOUTS_S, ReadoutEstimator, _mean
 from dualslam.frontends.tracking.rolling_shutter import RollingShutter, TurnMeter
-from dualslam.frontends.tracking.row_shifts import correct_shutter
-from dualslam.frontends.tracking.turning import turn_between
+from dualslam.frontends.tracking.turning import correct_shutter, turn_between
 from dualslam.system.system import System
 from dualslam.testing.point_world import (
     CAMERA,

@@ -18,8 +18,7 @@ from dualslam.core.errors import InputError
 from dualslam.core.geometry import se3
 from dualslam.core.types import FloatArray, Frame
 from dualslam.io.export.exported_map import ExportedMap
-from dualslam.io.export.metric import DICTIONARIES, by_distance, by_height, by_marker
-from dualslam.io.metric_scale import SCALE, read_scale, write_scale
+from dualslam.io.export.metric import DICTIONARIES, SCALE, by_distance, by_height, by_marker, read_scale, write_scale
 from dualslam.io.run_folder import FRAME_COLUMNS
 from dualslam.io.run_reading import read_numbers
 from dualslam.testing.point_world import CAMERA
