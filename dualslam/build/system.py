@@ -9,8 +9,7 @@ from functools import partial
 
 import numpy as np
 
-from dualslam.atlas.stored_map import StoredMap
-from dualslam.atlas.tidying import tidy
+from dualslam.atlas.stored_map import StoredMap, tidy
 from dualslam.backend.final_refinement import refine_submap, settle_ties
 from dualslam.backend.local_ba import adjust_and_prune
 from dualslam.build.checks import check_config, check_given

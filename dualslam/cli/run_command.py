@@ -23,7 +23,7 @@ from dualslam.io.atomic import write_text
 from dualslam.io.reduced import MAX_SIDE_PX
 from dualslam.io.run_folder import MAP_PAGE, REPORT
 from dualslam.io.sequence import RecordedSequence
-from dualslam.run.focal import open_without_calibration, with_camera_found, with_camera_of_map, with_prior
+from dualslam.run.before import open_without_calibration, with_camera_found, with_camera_of_map, with_prior
 from dualslam.run.measuring import read_rows
 from dualslam.run.session import Outcome, Watchers, check_out, run_to_folder
 from dualslam.run.sources import open_source

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Sequence, Set
 from dataclasses import replace
+from itertools import combinations
 
 import numpy as np
 
@@ -11,10 +12,13 @@ from dualslam.atlas.atlas import Link, LinkKind
 from dualslam.atlas.connections import Connections
 from dualslam.atlas.propagation import propagate_poses
 from dualslam.atlas.record import FrameStamp, Record
+from dualslam.core.config.settings import Config
 from dualslam.core.events import EventKind
 from dualslam.core.geometry import se3, sim3
 from dualslam.core.types import Failure, FailureReason, FloatArray, FrameStatus, IntArray
+from dualslam.linking import LinkRefusal, estimate_link
 from dualslam.map.frame_observations import Change
+from dualslam.map.split import sound_copy
 from dualslam.map.submap import Submap
 from dualslam.map.submap_change import change_of_frame
 from dualslam.recovery.job import FoundLink, RecoveredFrame, RecoveryJob, refusal_data
@@ -216,3 +220,31 @@ def condemn_tail(
     tail = {k for k in submap.keyframes if k >= since or (k > handover and k in own)}
     submap.condemn(tail)
     return len(submap.condemned)
+
+
+def link_overlaps(record: Record, connections: Connections, config: Config, own: Set[int], now: FrameStamp) -> None:
+    """Link the submaps of each set where they hold the same keyframes, when the run is over.
+
+    `own`: the submaps of this run.
+    """
+    with record.timer.measure("overlaps"):
+        for component in record.atlas.components():
+            if links := list(_overlaps(record, [m for m in component if m in own], config)):
+                connections.connect(links, now)
+
+
+def _overlaps(record: Record, submap_ids: list[int], config: Config) -> Iterator[Link]:
+    """Yield links between submaps, ascending, over the keyframes that both hold, where none stands on these yet."""
+    submaps = record.atlas.submaps
+    onsets = {event.submap: event.data["suspected_since"] for event in record.events.of_kind(EventKind.FAILED)}
+    linked = {frozenset((link.a, link.b)) for link in record.atlas.believed if link.keyframes}
+    for a, b in combinations(submap_ids, 2):
+        n_shared = len(submaps[a].keyframes.keys() & submaps[b].keyframes.keys())
+        if n_shared < config.linking.min_keyframes or {a, b} in linked:
+            continue
+        old, new = (sound_copy(submaps[m]) for m in (a, b))
+        found = estimate_link(old, new, config.linking, np.random.default_rng(config.seed), onsets.get(a))
+        link = found.unsure or found if isinstance(found, LinkRefusal) else found
+        if not isinstance(link, Failure):
+            known = link.S_old_new, link.covariance, LinkKind.RECOVERY, tuple(link.agreeing_keyframes.tolist())
+            yield Link(a, b, *known, doubtful=False, is_sure=link is found)

@@ -8,8 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from dualslam.atlas.renumbering import bring_to_pixels, renumbered
-from dualslam.atlas.stored_map import StoredMap
+from dualslam.atlas.stored_map import StoredMap, bring_to_pixels, renumbered
 from dualslam.build import build_system, create_frontend
 from dualslam.core.camera.mapped import own_camera
 from dualslam.core.config.files import load_run_config

@@ -29,7 +29,6 @@ from dualslam.core.resources import spare_cores
 from dualslam.core.schedule import SCHEDULE, Recorded, header_of
 from dualslam.core.types import Frame
 from dualslam.io.colours import Colours, keyframe_indices, landmark_colours, save_colours, save_pictures
-from dualslam.io.image_faults import ImageFaults
 from dualslam.io.map_store import load_atlas, save_atlas
 from dualslam.io.masks import hidden_pixels, masked
 from dualslam.io.run_folder import TRAJECTORY, RunFolder, RunRecord, check_vacant
@@ -39,13 +38,13 @@ from dualslam.io.video import WebcamSequence
 from dualslam.lab.disturbances import corrupted
 from dualslam.map.frame_records import FrameResult
 from dualslam.report import PlaceAlbum, SampleKeeper, read_run, report_page
+from dualslam.run.before import with_frontend_chosen
 from dualslam.run.claims import claims_in_atlas
-from dualslam.run.front_end import with_frontend_chosen
 from dualslam.run.interrupts import Interrupts
 from dualslam.run.judgement import judge_run
 from dualslam.run.map_camera import camera_that_fits, in_size_of_map
 from dualslam.run.measuring import Measured, measure, write_measured, write_relative
-from dualslam.run.no_map import StartRefusals
+from dualslam.run.no_map import ImageFaults, StartRefusals
 from dualslam.run.results import Trajectories, frame_rows, summarise, trajectories_of, truth_of_frames
 from dualslam.run.runner import RunReport, run_sequence
 from dualslam.run.sources import WorldSequence

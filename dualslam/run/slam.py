@@ -26,8 +26,8 @@ from dualslam.io.masks import read_mask
 from dualslam.io.times import UNIT_NAMES, epoch_unit
 from dualslam.map.frame_records import FrameResult
 from dualslam.report.run_data import RunData, read_run
+from dualslam.run.before import with_frontend_chosen
 from dualslam.run.claims import claims_in_atlas
-from dualslam.run.front_end import with_frontend_chosen
 from dualslam.run.judgement import judge_run
 from dualslam.run.results import frame_rows, trajectories_of
 from dualslam.run.runner import RunReport

@@ -26,8 +26,8 @@ from dualslam.places.handover import Handover
 from dualslam.places.revisits import Revisits
 from dualslam.places.sightings import Relocalised
 from dualslam.recovery.frame_buffer import SLOW_HZ, FrameBuffer
+from dualslam.recovery.fusion import link_overlaps
 from dualslam.recovery.manager import Recoveries
-from dualslam.recovery.overlaps import link_overlaps
 from dualslam.system.audit.photometric import PhotometricAudit
 from dualslam.system.audit.verdict import ReasonCode
 from dualslam.system.camera.background import Calibrations

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from dualslam.core.camera.base import Camera
-from dualslam.core.config.strict_model import StrictModel
+from dualslam.core.config.problems import StrictModel
 from dualslam.core.geometry import se3, so3
 from dualslam.core.pixels import PixelMatches, PosedImage
 from dualslam.core.types import FloatArray

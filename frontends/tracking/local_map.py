@@ -7,12 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from dualslam.core.arrays import quantile
 from dualslam.core.camera.base import Camera
 from dualslam.core.geometry import se3
 from dualslam.core.geometry.projection import project_points
 from dualslam.core.noise_model import MAJORITY, PROOF_VIEWS, TINY
 from dualslam.core.types import BoolArray, FloatArray, IntArray
-from dualslam.frontends.tracking.near_points import nearer_than_proven
 from dualslam.map.submap import Submap
 
 VIEW_COSINE_MIN = 0.5  # a patch seen from more than 60 degrees off its mean direction does not look the same
@@ -118,3 +118,25 @@ def trusted(submap: Submap, ids: IntArray, T_cam_submap: FloatArray, min_inliers
     if np.count_nonzero(proven) < max(SAFE * min_inliers, MAJORITY * len(ids)):
         return np.ones(len(ids), np.bool_)
     return ~nearer_than_proven(submap.depths(ids, T_cam_submap), proven)
+
+
+NEARER, NEAREST = 0.5, 0.05
+"""Too near is what is nearer than so many times the depth of the nearest proven points (this share of them): the lever
+is twice as long."""
+
+
+def nearer_than_proven(depth: FloatArray, proven: BoolArray) -> BoolArray:
+    """Return which points (N,) of depths (N,) are unproven, and nearer than any proof reaches; none where nothing is
+    proven.
+
+    On a scene that repeats itself wrong matches lie on the epipolar line, too, at any depth. Near ones weigh most: they
+    hold the camera where it is, and a turn takes the place of its motion. Where true points are near, some are proven.
+    """
+    if not proven.any():
+        return np.zeros(len(depth), np.bool_)
+    return ~proven & stands_before(depth, depth[proven])
+
+
+def stands_before(depth: FloatArray, others: FloatArray) -> BoolArray:
+    """Return which points (N,) stand far before all but a few others (M,)."""
+    return np.asarray(depth <= NEARER * quantile(others, NEAREST))

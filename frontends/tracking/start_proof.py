@@ -17,7 +17,7 @@ from dualslam.core.noise_model import MIN_CONSENSUS, PROOF_VIEWS, START_POINTS
 from dualslam.core.support import MAX_CHI2
 from dualslam.core.types import BoolArray, Failure, FailureReason, FloatArray, IntArray, Matches, Start, View
 from dualslam.frontends.tracking.direction import direction_sigma_deg
-from dualslam.frontends.tracking.near_points import nearer_than_proven, stands_before
+from dualslam.frontends.tracking.local_map import nearer_than_proven, stands_before
 from dualslam.frontends.tracking.resection import MIN_SAMPLE, resect
 from dualslam.frontends.tracking.two_view_hypotheses import MIN_NOISE2
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from dualslam.atlas import tidying
-from dualslam.atlas.tidying import tidy
+from dualslam.atlas import stored_map
+from dualslam.atlas.stored_map import tidy
 from dualslam.atlas.trajectory import compose
 from dualslam.map.submap import Submap
 from tests.places.worlds import lap, run
@@ -67,6 +67,6 @@ def test_culled_keyframes_that_something_names_stay_where_they_are() -> None:
 
 def test_of_very_many_frames_the_newest_stay(monkeypatch: pytest.MonkeyPatch) -> None:
     system = run(lap(), n=40)
-    monkeypatch.setattr(tidying, "MAX_EARLIER_FRAMES", 10)
+    monkeypatch.setattr(stored_map, "MAX_EARLIER_FRAMES", 10)
     poses = tidy(system.atlas, system.poses)
     assert sorted(poses) == sorted(system.poses)[-10:]

@@ -45,7 +45,7 @@ def fake(world: SyntheticSequence, monkeypatch: pytest.MonkeyPatch) -> Callable[
         truth = dict(enumerate(world.ground_truth_T_world_cam))
         monkeypatch.setattr("dualslam.run.session.build_system", builder(truth, **options))
         # No front end looks at the frames, so none need be chosen by them.
-        monkeypatch.setattr("dualslam.run.front_end.find_frontend", lambda *_: FrontendChoice("orb", "a fake"))
+        monkeypatch.setattr("dualslam.run.before.find_frontend", lambda *_: FrontendChoice("orb", "a fake"))
 
     install()
     return install

@@ -18,7 +18,7 @@ from dualslam.frontends.choice import STARTS_WITHIN, Candidate, choose_frontend
 from dualslam.frontends.features.orb import OrbFrontend
 from dualslam.frontends.features.sift import SiftFrontend
 from dualslam.lab.synthetic import make_sequence
-from dualslam.run.front_end import with_frontend_chosen
+from dualslam.run.before import with_frontend_chosen
 from dualslam.testing.point_world import CAMERA
 
 N_FEATURES, N_FRAMES = 500, 30

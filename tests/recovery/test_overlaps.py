@@ -9,7 +9,7 @@ from dualslam.atlas.atlas import LinkKind
 from dualslam.core.config.settings import Config
 from dualslam.core.events import EventKind
 from dualslam.core.geometry import sim3
-from dualslam.recovery.overlaps import link_overlaps
+from dualslam.recovery.fusion import link_overlaps
 from dualslam.testing.atlas_world import DriftingMap
 
 SHARED = range(60, 75)

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dualslam.atlas.renumbering import bring_to_pixels
+from dualslam.atlas.stored_map import bring_to_pixels
 from dualslam.cli import main
 from dualslam.core.config.settings import Config
 from dualslam.core.geometry.umeyama import umeyama

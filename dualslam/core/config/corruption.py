@@ -7,7 +7,7 @@ from typing import Self
 
 from pydantic import Field, model_validator
 
-from dualslam.core.config.strict_model import StrictModel
+from dualslam.core.config.problems import StrictModel
 
 
 class CorruptionKind(StrEnum):

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, model_validator
 
 from dualslam.core.config.corruption import Corruption
-from dualslam.core.config.strict_model import StrictModel as StrictModel  # part of this module, too
+from dualslam.core.config.problems import StrictModel as StrictModel  # part of this module, too
 from dualslam.core.noise_model import ROBUST_K
 
 

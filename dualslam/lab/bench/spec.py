@@ -13,7 +13,7 @@ from pydantic import Field, model_validator
 from dualslam.core.config import strict_yaml
 from dualslam.core.config.corruption import Cause, Corruption, CorruptionKind
 from dualslam.core.config.files import model_from_dict
-from dualslam.core.config.strict_model import StrictModel
+from dualslam.core.config.problems import StrictModel
 from dualslam.core.errors import ConfigError
 
 _NAME = r"^[A-Za-z0-9][A-Za-z0-9._+-]*$"

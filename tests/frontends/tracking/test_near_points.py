@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from dualslam.frontends.tracking.near_points import nearer_than_proven, stands_before
+from dualslam.frontends.tracking.local_map import nearer_than_proven, stands_before
 
 
 def test_only_what_is_unproven_and_nearer_than_any_proof_is_left_out() -> None:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from dualslam.io.image_faults import DARK, FLICKER, MOSAIC, ImageFaults
 from dualslam.lab.synthetic import make_sequence
+from dualslam.run.no_map import DARK, FLICKER, MOSAIC, ImageFaults
 
 
 @pytest.fixture(scope="module")

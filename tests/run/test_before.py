@@ -20,7 +20,7 @@ from dualslam.core.types import FloatArray
 from dualslam.frontends.tracking import focal_search
 from dualslam.io.map_store import save_atlas
 from dualslam.lab.synthetic import make_sequence
-from dualslam.run.focal import open_without_calibration, with_camera_found, with_camera_of_map, with_prior
+from dualslam.run.before import open_without_calibration, with_camera_found, with_camera_of_map, with_prior
 from dualslam.run.session import SEARCHED_SIGMA, refined_camera
 from dualslam.system.system import System
 
