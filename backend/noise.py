@@ -19,8 +19,7 @@ seen from further apart, have some more. 1: gates are never tighter than the pix
 GAUGE_SIGMA = 1e-5
 """Sigma of the priors that fix a gauge (rad, and submap units): tight, yet far from the limits of a double."""
 MIN_VIEWS, MIN_OBSERVATIONS = 4, 400
-"""What the residuals' variance is read from: landmarks of so many views, and so many of their observations, which put
-the median's own sigma at 7 %."""
+"""Landmarks of so many views, and their observations, that give the residuals' variance: its sigma is then 7 %."""
 
 
 def residual_variance(chi2: FloatArray, n_views: IntArray, least: float) -> float:

@@ -142,8 +142,7 @@ class Move:
     bend_mu: float  # farthest that a keyframe goes
     bent: bool  # whether any goes anywhere
     steps: FloatArray
-    """(K - 1, 7, 7): covariances from knot to knot of the warp, as the submap's own factors give them: what is to hold
-    the bend."""
+    """(K - 1, 7, 7): covariances from knot to knot of the warp, as the submap's own factors give them."""
 
 
 def bend_submap(submap: Submap, warp: Warp) -> None:

@@ -20,8 +20,7 @@ from dualslam.core.geometry import se3, sim3
 from dualslam.core.types import Failure
 
 STILL = 1e-4
-"""Bends up to this (radians, share of scale, submap units: less than a tenth of a pixel) are none: the arrays stay as
-they are, to the bit."""
+"""Bends up to this (radians, share of scale, submap units: below a tenth of a pixel) leave the arrays to the bit."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -38,8 +37,7 @@ class AtlasReport:
     drift: float = 1.0
     """Errors within submaps over what they claim, as sure connections show (the largest of the linked sets)."""
     newest_chi2: float | None = None
-    """Of the connection that came last, against all others (7 degrees of freedom); None where nothing else ties its
-    ends."""
+    """Of the connection that came last, against all others (7 degrees of freedom); None where nothing ties its ends."""
     bent: dict[int, float] = field(default_factory=dict)
     """By submap: farthest move of a keyframe within its submap's frame, in the submap's unit; those that moved."""
     placed: dict[int, float] = field(default_factory=dict)  # by submap: how far its frame's keyframe went in the world

@@ -49,8 +49,7 @@ class Skeleton:
     """Whether there is one way only between any two of its submaps, and none was ever bent: nothing to optimise."""
     T_submap_node: FloatArray  # (N, 4, 4): keyframe to submap
     steps: dict[int, FloatArray]
-    """dict of int to (K - 1, 7, 7): for each submap the covariances from node to node, as its own factors give them (a
-    tree: of no meaning)."""
+    """dict of int to (K - 1, 7, 7): by submap, covariances from node to node, as its own factors give them."""
 
     def knots(self, submap_id: int) -> tuple[list[int], list[int]]:
         """Return rows and keyframes of a submap's nodes, ascending."""

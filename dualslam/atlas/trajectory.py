@@ -129,9 +129,7 @@ class Worlds:
         self._sure: set[int] = set()
 
     def of(self, submap_id: int) -> tuple[FloatArray, int]:
-        """Return the current ``S_world_submap`` (4, 4), and the submap whose frame and unit the world has: the first of
-        its linked set, or the saved map's.
-        """
+        """Return the current ``S_world_submap`` (4, 4), and the submap whose frame and unit the world has."""
         self._compose()
         return self._found[submap_id]
 

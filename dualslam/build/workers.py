@@ -37,8 +37,7 @@ JOB_LIMIT_S = 30.0
 MAP_KINDS = (JobKind.START, JobKind.GRAPH)
 """Jobs of the live map's worker, in order. It keeps a state from job to job."""
 GRAPH_NICENESS, WALK_NICENESS = 3, 8
-"""Of the process that has the graphs, and of those for long work: half and a sixth of the share of what tracks,
-where cores are short."""
+"""Of the process that has the graphs, and of long work: half and a sixth of tracking's share of short cores."""
 
 
 def inline_handlers(

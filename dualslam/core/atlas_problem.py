@@ -21,8 +21,8 @@ class AtlasEdge:
     second: int
     S_first_second: FloatArray  # (4, 4): ``[[s R, t], [0, 1]]``, takes coordinates in the second keyframe to the first
     covariance: FloatArray
-    """(7, 7): of the right perturbation ``S_first_second @ exp(xi)``: rotation, translation, log-scale, in the second
-    keyframe's frame and unit."""
+    """(7, 7): of xi in ``S_first_second @ exp(xi)``: rotation, translation, log-scale, in the second keyframe's unit.
+    """
     kind: str  # ``within`` a submap, or the kind of the connection
     doubtful: bool = False  # where true, and where others contradict it, it may be rejected
     known: bool = False  # whether an earlier solution has believed it

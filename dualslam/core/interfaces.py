@@ -1,6 +1,4 @@
-"""The interfaces of the system, as Protocols: what a front end, a graph and a sequence must offer to be used by the
-rest.
-"""
+"""The interfaces of the system, as Protocols: what a front end, a graph and a sequence offer to the rest."""
 
 from __future__ import annotations
 

@@ -30,8 +30,7 @@ class RowSource:
     rows: Sequence[MeasurementRow]
     has_clock: bool = True  # false: its times are those of the frames, and no offset is estimated
     origin: tuple[float, float, float] | None = None
-    """Latitude, longitude (degrees) and height (metres) of the origin, if positions came as
-    such. They are then east, north, up."""
+    """Latitude, longitude (degrees), height (metres) of the origin of east, north, up, if positions came as such."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -16,8 +16,7 @@ MIN_CONSENSUS = 12
 START_POINTS = 50
 """Points of two views that a map starts from, at least, as they are left after the first bundle adjustment."""
 MIN_DEPTH_MU = 1e-3
-"""Points nearer to the camera's plane are taken as behind it, and shorter baselines as none. A submap's median depth is
-1 at first."""
+"""Nearer points count as behind the camera, shorter baselines as none. A submap's median depth is 1 at first."""
 MAX_DEPTH_SIGMA = 0.25
 """A point's distance counts as known to this relative standard deviation. It is about half a degree of parallax at 1 px
 and a focal length of 700 px."""
@@ -31,14 +30,12 @@ MAX_SLIP = 0.1
 """Share of the way that a map can have lost beyond what its turn and change of scale explain. 32 right loops (HoloLens,
 TUM, 7-Scenes, a phone) lost 3 % at most. The copy of a thing lies a period away, and is neither turned nor scaled."""
 SAME_WITHIN = 0.1
-"""Distance, relative to the size or depth of what is seen, within which two answers are one: twice the 5 % of a wrong
-link."""
+"""Distance, relative to the size or depth of what is seen, within which two answers are one."""
 GROUP = 5
 """Keyframes that see much the same: about as long as a landmark lives on a road. Fewer say little about a place's
 scale, and what lies more than twice as far off shares little with them."""
 SAME_POINT_PX = 3.0
-"""Distance at the finest octave within which two keypoints can be the same point: three sigmas of a well-posed
-landmark's pixel."""
+"""Distance at the finest octave within which two keypoints can be the same point: three sigmas of a pixel."""
 MIN_LANDMARKS = 6
 """Landmarks that hold a pose: three fix it, twice as many tell how well."""
 COVISIBLE = 15

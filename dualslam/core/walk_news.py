@@ -34,8 +34,7 @@ class WalkNews:
     n_posed: int  # frames that have one
     T_submap_cam: NDArray[np.float32] | None  # (4, 4): of the last frame that has a pose
     way: NDArray[np.float32]
-    """(N, 3) float32: where the camera was, the earliest frame first: `MAX_POINTS` at most, as even as the frames
-    are."""
+    """(N, 3) float32: where the camera was, the earliest frame first: `MAX_POINTS` at most, evenly."""
 
 
 class WalkTrace:

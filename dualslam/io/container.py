@@ -45,9 +45,7 @@ def equivalent_focal_mm(path: Path) -> float | None:
 
 
 def edited_s(path: Path) -> float | None:
-    """Return the seconds that the edit lists of a film leave of its longest track, trimmed or not; None where it has
-    none.
-    """
+    """Return the seconds that the edit lists of a film leave of its longest track; None where it has none."""
     try:
         with path.open("rb") as file:
             boxes = _Boxes(file)

@@ -16,8 +16,7 @@ MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0}
 LIKELY = (0.3, 20.0)
 """Focal lengths over the image's longer side that a lens may have; anything else is a mistake."""
 SIGMA = 0.05
-"""Of the logarithm of what they tell: whole millimetres of 26 leave 2 %, and what is meant, the image's diagonal or its
-width, 4 %."""
+"""Of its logarithm: whole millimetres of 26 leave 2 %, and diagonal or width, whichever is meant, 4 %."""
 SAME_SHAPE = 0.02
 """Relative difference of two aspect ratios up to which an image has only been scaled, not cropped."""
 

@@ -224,10 +224,8 @@ MINORITY_DEFORMATION = 0.03
 """Relative deformation (standard deviation) of a map beyond a place where it hands on fewer than half of what its
 keyframes see. Where an occluder comes in, maps of rendered worlds lost up to 8 % of their scale and claimed 0.9 %."""
 MIN_IMAGE_SPREAD = 0.25
-"""Share of the image, along either axis, that the agreeing landmarks must cover (5 % to 95 % of them, against the
-keypoints of the same keyframes)."""
+"""Share of the image, along either axis, that 90 % of the agreeing landmarks must cover, of the keypoints' own."""
 MAX_SCALE = 50.0
-"""Largest scale, and inverse of the smallest: submaps start with a median depth of 1, so that the scale is the ratio
-of the depths at their starts."""
+"""Largest scale, and inverse of the smallest: that is the ratio of the depths at the submaps' starts."""
 MAX_HYPOTHESES = 512
 """Triplets that RANSAC draws at most."""

@@ -202,9 +202,7 @@ def _measure(fits: _Fits, last_before: int, known: _Fits, slack_mu: float = 0.0)
 
 
 def _explained(off: FloatArray, before: FloatArray, after: FloatArray, over_s: float) -> tuple[float, float]:
-    """Return how far a change of velocity displaces a camera, along the change, at most; and the part of an error that
-    it leaves.
-    """
+    """Return how far a change of velocity displaces a camera at most, and the part of an error that it leaves."""
     change = after - before
     along = change / max(float(np.linalg.norm(change)), 1e-300)
     speeds, mean = (float(np.linalg.norm(v)) for v in (before, after)), 0.5 * (before + after)

@@ -25,8 +25,7 @@ class KeyframeVotes:
 
     rotation_rad: FloatArray  # (K,): angle between the camera's orientations in the two maps
     centre: FloatArray
-    """(K,): distance between its centres, relative to the distance of the landmarks it sees (or of the centre of the
-    overlap, if that is more)."""
+    """(K,): distance between its centres, relative to that of the landmarks it sees (or of the overlap's centre)."""
     agrees: BoolArray  # (K,)
     can_vote: BoolArray  # (K,)
 

@@ -41,8 +41,8 @@ class SubmapDelta:
     first_kf: IntArray  # (L,)
     n_landmarks: int  # rows of the table
     kept_rows: IntArray | None
-    """(R,): rows of the replica's observations that stay in its table, if some do not. All other rows are named as they
-    are numbered after that."""
+    """(R,): rows of the replica's observations that stay in its table, if some do not; others are named as after that.
+    """
     # Landmarks and observations that have died.
     dead_landmarks: IntArray
     dead_rows: IntArray

@@ -138,8 +138,7 @@ def sigmas_at_pairs(xyz_query: FloatArray, S: FloatArray, covariance: FloatArray
 
 
 N_ALIKE = 4
-"""Landmarks of the other map that one landmark is paired with: the number of copies of a thing that can be
-distinguished."""
+"""Landmarks of the other map that one landmark is paired with: how many copies of a thing are told apart."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -61,8 +61,7 @@ class Relocalised:
 
     odometry: Seeker  # goes on there
     earlier: list[tuple[Track, FloatArray]]
-    """list of (Track, (4, 4)): the frames before the newest that it has posed, with their poses relative to the
-    keyframe `reference`."""
+    """list of (Track, (4, 4)): frames before the newest that it has posed, with their poses relative to `reference`."""
     track: Track  # the newest frame's
     reference: int
 

@@ -93,8 +93,7 @@ class RecoveryResult:
     looks_alike: bool = False
     """Whether beyond a gap two poses explained as much: no later walk over it would tell them apart."""
     needs_camera: bool = False
-    """Whether no later walk does better under this camera: the map's pixels contradict it, or all keyframes of the lost
-    maps leave the scale open."""
+    """Whether no later walk does better under this camera: the pixels contradict it, or the scale stays open."""
     stopped_at: int | None = None
     """The frame at which all attempts have stopped, none of which met a lost map's keyframes."""
     tries: LinkTries = field(default_factory=LinkTries)  # the job's, with the tries of this walk

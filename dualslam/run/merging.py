@@ -30,8 +30,7 @@ from dualslam.system.audit.verdict import Level, Reason, ReasonCode
 from dualslam.system.system import System
 
 APART_S = 10.0
-"""Between the last frame of the first run and the first of the second, where their clocks overlap: no pose, step or
-measurement reaches across."""
+"""Between the last frame of the first run and the first of the second: no pose, step or measurement reaches across."""
 
 JUDGED_ANEW = frozenset(
     {ReasonCode.NO_MAP, ReasonCode.UNPOSED, ReasonCode.UNJOINED, ReasonCode.DROPPED, ReasonCode.CLOCK}

@@ -18,8 +18,7 @@ from dualslam.recovery.manager import Recoveries
 from dualslam.system.state import State
 
 TAKEN_IN_A_FRAME = 1000
-"""Landmarks that the index of places takes in at each frame in real time: 2 to 3 ms, where all that came during reverse
-tracking take 20."""
+"""Landmarks that the index of places takes in at each frame in real time: 2 to 3 ms."""
 
 
 class PlaceKeeping:

@@ -93,8 +93,7 @@ class Message:
     picture: Picture | None  # none where there is no image
     changed: tuple[SubmapArrays, ...]  # submaps of which anything but their place is new
     components: tuple[dict[int, FloatArray], ...]
-    """tuple of dict of int to (4, 4): the linked sets of submaps: each submap's similarity into the frame of the set's
-    first."""
+    """tuple of dict of int to (4, 4): by linked set, each submap's similarity into the frame of the set's first."""
     links: tuple[LinkLine, ...]
     statuses: tuple[str, ...]  # of all frames so far, or of those after `n_statuses_before`
     n_statuses_before: int  # 0 where frames may have been posed later: then `statuses` has all

@@ -110,9 +110,7 @@ class PnpOdometry:
         return self._live.relative_pose(track)
 
     def keyframe_due(self, track: Track) -> Ruling:
-        """Whether the frame should become a keyframe: in any case after a gap relocalisation, which only its landmarks
-        tie down.
-        """
+        """Whether the frame should become a keyframe: always after a gap relocalisation, held by its landmarks only."""
         if track.wide:
             return Ruling(True, detail="it lies beyond a gap")
         return self._live.keyframe_due(track)

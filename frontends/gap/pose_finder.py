@@ -259,9 +259,7 @@ class PoseFinder:
         return Crossing(_given(wide), before, before.pose.T_cam_submap @ se3.inverse(wide.T_cam_submap))
 
     def _frames_before_gap(self) -> list[int]:
-        """Return the last frame, and others spread over the keyframes before it: the wider these stand, the better is
-        depth known.
-        """
+        """Return the last frame, and others spread widely over the keyframes before it, which know depth the better."""
         posed = self._map.posed
         keyframes = [k for k in posed[:-1] if k in self._submap.keyframes][1 - SEED_KEYFRAMES :]
         spread = np.linspace(0, len(keyframes) - 1, min(GAP_FRAMES - 1, len(keyframes))).astype(np.int64)

@@ -51,9 +51,7 @@ finds are within 0.25 to 0.5 px of the truth."""
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _PosePrior:
-    """What a gap relocalisation knows of a frame's pose, beside the landmarks that it sees: the pose and its
-    information (6, 6).
-    """
+    """What a gap relocalisation knows of a frame's pose beside its landmarks: the pose and its information (6, 6)."""
 
     T_cam_submap: FloatArray
     information: FloatArray
@@ -160,9 +158,7 @@ class Refinder:
         return found
 
     def _pose_covariance(self, track: Track, pose_prior: _PosePrior) -> FloatArray:
-        """Return how well the frame's pose is known (6, 6), by the gap relocalisation and by the landmarks that it
-        sees.
-        """
+        """Return how well the gap relocalisation and the landmarks in view know the frame's pose (6, 6)."""
         by_landmarks = track_uncertainty(self._submap, track)
         if by_landmarks is None:
             return _inverse(pose_prior.information)

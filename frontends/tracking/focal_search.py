@@ -47,8 +47,7 @@ FINE_CELLS = 10
 """Of the coarse grid, that are asked finely."""
 
 LOG_FOCAL_PRIOR, LENS_PRIOR = (np.log(0.75), 0.3), (0.0, 0.1)
-"""Mean and sigma, of cameras that people film with: telephones 0.7 to 0.8 of that side, webcams 0.9 to 1, action
-cameras 0.45 to 0.6."""
+"""Mean and sigma, of cameras that people film with: telephones 0.7 to 0.8, webcams 0.9 to 1, action 0.45 to 0.6."""
 TOLD_RIGHT = 0.9
 """How likely a source's own data tell of these images: one may have been cropped since."""
 DEGREES_OF_FREEDOM = 3.0

@@ -55,8 +55,8 @@ class LocalMap:
     xyz_mu: FloatArray  # (N, 3)
     normal: FloatArray  # (N, 3)
     reference_mu: FloatArray
-    """(N,): distance times patch scale at the view that described the landmark: the distance at which its patch has
-    scale 1."""
+    """(N,): distance times patch scale where the landmark was described: the distance at which its patch has scale 1.
+    """
     descriptors: NDArray[np.generic]  # (N, D)
 
     @classmethod
@@ -121,8 +121,7 @@ def trusted(submap: Submap, ids: IntArray, T_cam_submap: FloatArray, min_inliers
 
 
 NEARER, NEAREST = 0.5, 0.05
-"""Too near is what is nearer than so many times the depth of the nearest proven points (this share of them): the lever
-is twice as long."""
+"""Too near is nearer than so many times the depth of the nearest proven points (this share of them)."""
 
 
 def nearer_than_proven(depth: FloatArray, proven: BoolArray) -> BoolArray:

@@ -154,8 +154,8 @@ def _step(b: ReadoutQuestion) -> float:
 
 
 def _jacobians(b: ReadoutQuestion, front: BoolArray, root_weight: FloatArray) -> tuple[Any, Any]:
-    """Return the whitened derivatives, sparse: by all poses and, last, the readout time (2 R, 6 F + 1); by the points
-    (2 R, 3 N).
+    """Return the sparse whitened derivatives: by poses and, last, the readout time (2 R, 6 F + 1); by points (2 R, 3
+    N).
     """
     n = len(b.kf)
     J, J_point = np.zeros((n, 2, 7)), np.zeros((n, 2, 3))

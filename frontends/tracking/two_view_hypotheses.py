@@ -23,8 +23,7 @@ from dualslam.frontends.tracking.resection import poselib_camera
 from dualslam.frontends.tracking.turn_hypotheses import TurnHypotheses
 
 PLANAR_SHARE = 0.6
-"""Of what the essential matrix explains: a board gives 0.65 and more (40 pairs of rendered views), a street 0.3 to 0.4,
-a room 0.3 to 0.7."""
+"""Of what the essential matrix explains: a board gives 0.65 and more, a street 0.3 to 0.4, a room 0.3 to 0.7."""
 
 MIN_NOISE2 = 0.04
 """Of pixels a fifth as noisy as supposed: below, the pictures are drawn, and what is off is the lens."""

@@ -30,8 +30,7 @@ class FocalSearch:
     focal_px: float
     log_sigma: float  # standard deviation of its logarithm
     lens: float
-    """Of the division model, at half the image's longer side: an undistorted radius is r / (1 + lens r^2); zero:
-    none."""
+    """Of the division model, at half the longer side: an undistorted radius is r / (1 + lens r^2); zero: none."""
     # Of the image, pixels.
     width: int
     height: int

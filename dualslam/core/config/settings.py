@@ -49,8 +49,7 @@ class CameraConfig(StrictModel):
     """Find pixels that stand still in the image while the rest moves (a bonnet, black bars, a logo), and leave them
     out. No map starts while the camera itself stands still."""
     mask: str | None = None
-    """Image of the frames' size whose black pixels show no scene. Or a folder with one for each frame, named as the
-    frames or in their order."""
+    """Image of the frames' size whose black pixels show no scene; or a folder with one a frame, by name or order."""
 
 
 class InitialiserConfig(StrictModel):
@@ -182,8 +181,7 @@ class RecoveryConfig(StrictModel):
     self-calibration. With any there is one more, which solves the live map's graph. 0: inline, in the tracking process,
     which waits."""
     finish_wait_s: float = Field(30.0, ge=0)
-    """How long the end of a run that was interrupted waits for walks that are still under way. Any other end waits for
-    all of them."""
+    """How long the end of a run that was interrupted waits for walks under way. Any other end waits for all of them."""
 
 
 class BufferConfig(StrictModel):
@@ -269,9 +267,7 @@ class LinkingConfig(StrictModel):
 
     @property
     def max_live_rotation_deg(self) -> float:
-        """Rotation by which the new map may bend, from the overlap to its live end, under the camera that its pixels
-        ask for.
-        """
+        """Rotation by which the camera that the pixels ask for may bend the new map from overlap to live end."""
         return self.wrong_rotation_deg / 2
 
     @property

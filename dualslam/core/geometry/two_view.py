@@ -81,8 +81,7 @@ class HomographyPoses:
 
     T_b_a: FloatArray  # (M, 4, 4): translations in units of the distance of the plane from camera a
     normal_a: FloatArray
-    """(M, 3): unit normal, ``normal_a' X_a`` is the distance: it points away from camera a where the plane is in front
-    of it."""
+    """(M, 3): unit normal, ``normal_a' X_a`` is the distance: it points away from a camera a before the plane."""
 
 
 def decompose_homography(H_b_a: FloatArray, K: FloatArray) -> HomographyPoses:

@@ -46,8 +46,7 @@ class KorniaOptions(StrictModel):
     """`frontend.options` of the kornia front end."""
 
     detector: Literal["dog", "harris", "xfeat", "aliked", "disk"] = "dog"
-    """`dog` (difference of Gaussians) and `harris` are described by RootSIFT and need no weights; the others are
-    networks that describe what they detect."""
+    """`dog` and `harris` are described by RootSIFT and need no weights; the others are networks."""
     matcher: Literal["smnn", "adalam", "lightglue"] = "adalam"
     """Without a guide: mutual nearest neighbours with a ratio test both ways, AdaLAM, or LightGlue (for a network)."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
