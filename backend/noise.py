@@ -25,9 +25,7 @@ MIN_VIEWS, MIN_OBSERVATIONS = 4, 400
 def residual_variance(chi2: FloatArray, n_views: IntArray, least: float) -> float:
     """Return the variance of whitened residuals that gates go by (`variance_by_median`).
 
-    A lens model's error is much the same in neighbouring views. So residuals are smaller than the error of a pixel, and
-    a gate in the pixel's sigmas lets outliers in. Where pixels are noisier than their sigmas say, a gate that follows
-    opens.
+    A lens model's error is much the same in neighbouring views, so that a gate in the pixel's sigmas lets outliers in.
 
     - `chi2` (R,): squared whitened residuals (2 degrees of freedom) of observations.
     - `n_views` (R,): views that each one's landmark has.

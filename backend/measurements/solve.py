@@ -32,8 +32,7 @@ def solve_metric(
 
     `known_offsets_s`: of clocks, by source, that were estimated with another map: they are not estimated again.
 
-    Raises `InputError`, in one sentence, where the measurements cannot belong to the map: where they do not fit as they
-    are, and fit far better read otherwise. Raises `SolverError`.
+    Raises `InputError`, in one sentence, where the measurements do not fit the map as they are. Raises `SolverError`.
     """
     known = known_offsets_s or {}
     names = ", ".join(source.name for source in sources)

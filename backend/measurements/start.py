@@ -116,8 +116,7 @@ def _positions(path: CameraPath, source: MeasurementSource, offset_s: float) -> 
 def _align(c: FloatArray, p: FloatArray, sigma: float, up: FloatArray | None) -> FloatArray | None:
     """Align camera centres with positions of which less than half are wrong; None where they have no extent.
 
-    Each position counts once more, a sigma higher. So the camera's up fixes the turn of a straight path about itself,
-    and weighs little on a path that is wider than its sigmas.
+    Each position counts once more, a sigma higher: the camera's up fixes the turn of a straight path about itself.
     """
     if len(c) < 3:
         return None

@@ -15,7 +15,8 @@ from dualslam.atlas.stored_map import StoredMap
 from dualslam.cli.early import check_free
 from dualslam.cli.view_command import save_recording
 from dualslam.core.errors import DualSlamError, InputError, OutputError
-from dualslam.core.types import FloatArray, IntArray
+from dualslam.core.geometry import se3
+from dualslam.core.types import IntArray
 from dualslam.io.atomic import write_text
 from dualslam.io.colours import keyframe_indices, landmark_colours, load_pictures
 from dualslam.io.export.exported_map import ExportedMap, flatten, read_stored, with_frames
@@ -189,9 +190,9 @@ def _copy_trajectory(args: argparse.Namespace) -> int:
         write_text(args.out, text)
     elif args.to == "tum":
         trajectory = read_tum(source)
-        write_tum(args.out, replace(trajectory, T_world_cam=_in_metres(trajectory.T_world_cam, metres)))
+        write_tum(args.out, replace(trajectory, T_world_cam=se3.scaled(trajectory.T_world_cam, metres)))
     else:
-        rows = [" ".join(f"{x:.9g}" for x in T[:3].ravel()) for T in _in_metres(read_kitti(source), metres)]
+        rows = [" ".join(f"{x:.9g}" for x in T[:3].ravel()) for T in se3.scaled(read_kitti(source), metres)]
         write_text(args.out, "".join(f"{row}\n" for row in rows))
     if not args.quiet:
         print(f"trajectory, in {_unit(metres)}, in {args.out}", flush=True)
@@ -207,9 +208,3 @@ def _write_recording(args: argparse.Namespace) -> int:
 
 def _unit(metres: float | None) -> str:
     return "the map's unit" if metres is None else "metres"
-
-
-def _in_metres(T_world_cam: FloatArray, metres: float) -> FloatArray:
-    T = np.array(T_world_cam)
-    T[:, :3, 3] *= metres
-    return T

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from dualslam.core.errors import InputError
+from dualslam.core.geometry.se3 import from_parts
 from dualslam.core.geometry.so3 import matrix_from_quat_xyzw
 from dualslam.core.types import FloatArray
 from dualslam.io.camera_keys import camera_of_mapping
@@ -103,7 +104,5 @@ def _read_truth(path: Path, T_body_cam: FloatArray) -> Trajectory:
     table = np.array(rows).reshape(-1, 7)
     if len(table) == 0 or not np.isfinite(table).all():
         raise InputError(f"{path} is empty or holds a value that is not finite; fetch it again.")
-    T_world_body = np.tile(np.eye(4), (len(table), 1, 1))
-    T_world_body[:, :3, :3] = matrix_from_quat_xyzw(table[:, [4, 5, 6, 3]])
-    T_world_body[:, :3, 3] = table[:, :3]
+    T_world_body = from_parts(matrix_from_quat_xyzw(table[:, [4, 5, 6, 3]]), table[:, :3])
     return Trajectory(checked_times(times, str(path)), T_world_body @ T_body_cam)

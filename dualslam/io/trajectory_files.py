@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from dualslam.core.errors import InputError, OutputError
+from dualslam.core.geometry.se3 import from_parts
 from dualslam.core.geometry.so3 import matrix_from_quat_xyzw, quat_xyzw_from_matrix
 from dualslam.core.trajectory import Trajectory as Trajectory  # read and written here
 from dualslam.core.types import BoolArray, FloatArray, IntArray
@@ -43,10 +44,7 @@ def read_tum(path: str | Path, *, skip_nan: bool = False, allow_empty: bool = Fa
             f"{path}: the quaternion of pose {bad} has a norm near zero; columns are t tx ty tz qx qy qz qw."
         )
     table = table[np.argsort(table[:, 0], kind="stable")]
-    T_world_cam = np.tile(np.eye(4), (len(table), 1, 1))
-    T_world_cam[:, :3, :3] = matrix_from_quat_xyzw(table[:, 4:8])
-    T_world_cam[:, :3, 3] = table[:, 1:4]
-    return Trajectory(table[:, 0].copy(), T_world_cam)
+    return Trajectory(table[:, 0].copy(), from_parts(matrix_from_quat_xyzw(table[:, 4:8]), table[:, 1:4]))
 
 
 def write_tum(path: str | Path, trajectory: Trajectory) -> None:
@@ -67,9 +65,8 @@ def read_kitti(path: str | Path) -> FloatArray:
     """Read KITTI poses: one line of 12 numbers (a 3x4 matrix by rows, camera to world) each. Returns (N, 4, 4)."""
     table = read_number_table(path, 12, "a KITTI pose file (12 numbers a line)")
     _refuse_not_finite(path, table)
-    T_world_cam = np.tile(np.eye(4), (len(table), 1, 1))
-    T_world_cam[:, :3, :] = table.reshape(-1, 3, 4)
-    return T_world_cam
+    rows = table.reshape(-1, 3, 4)
+    return from_parts(rows[:, :, :3], rows[:, :, 3])
 
 
 def write_kitti(path: str | Path, T_world_cam: FloatArray, frames: ArrayLike, frames_path: str | Path) -> None:

@@ -178,10 +178,9 @@ def pose_frames(
 
 
 def bypass(record: Record, recovered_frames: Collection[RecoveredFrame], new_id: int, handover: int) -> int:
-    """Let the newest part of a linked old map take its poses from the new one; return of how many frames.
+    """Let the newest part of a linked old map take its poses from the new one, `new_id`; return of how many frames.
 
-    - `new_id`: the submap that walked.
-    - `handover`: the newest keyframe that agrees in both maps: what is beyond it changes.
+    `handover`: the newest keyframe that agrees in both maps: what is beyond it changes.
     """
     poses, n_bypassed = record.poses, 0
     for frame in recovered_frames:

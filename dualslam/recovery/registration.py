@@ -1,8 +1,7 @@
 """Registration of frames in a finished map, as structure from motion does it: one by one, the surest first.
 
-Tracking ends where a frame shows too few landmarks of the frames before it. Other parts of the same map may show them:
-all frames are known now, whatever their order. Each frame is posed by all keyframes that it resembles together, becomes
-a keyframe, and shows the way to the next.
+Each frame is posed by all keyframes that it resembles together, whatever their order, becomes a keyframe, and shows the
+way to the next.
 """
 
 from __future__ import annotations

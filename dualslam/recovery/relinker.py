@@ -46,7 +46,7 @@ class Relinker:
     - `min_shared`: keyframes that both maps must hold before a link is tried.
 
     - `has_seen_enough`: whether the next keyframes change nothing: the walk has met enough of a lost submap's healthy
-      part. Or it has met enough keyframes beyond a tear of its own map to test everything that could hold it together.
+      part, or of what could hold its own torn map together.
     """
 
     def __init__(

@@ -1,11 +1,11 @@
 """Algorithm 1: reverse tracking from a new submap until it overlaps a lost one so well that a Sim(3) links the two.
 
-The walk is a visual front end, given the buffered frames latest first. It sees images and features only, never the
-old map's poses or landmarks: a link must not confirm itself. What it takes from the old map is which frames were
-keyframes, so that both maps hold the same ones. Several attempts, each with poses from another front end, start from
-the same snapshot until one leads to a link. An attempt's errors do not reach the next.
+The walk is a visual front end, given the buffered frames latest first. It sees images and features only, never the old
+map's poses or landmarks: a link must not confirm itself. It takes from the old map which frames were keyframes, so that
+both maps hold the same ones. Several attempts, each with poses from another front end, start from the same snapshot
+until one leads to a link.
 
-It is a job on a snapshot that nobody else changes: it can run in a process of its own, and be merged when it is ready.
+It is a job on a snapshot that nobody else changes: it can run in a process of its own.
 """
 
 from __future__ import annotations
@@ -143,8 +143,7 @@ def _link_with_doubt(walk: Walk, parts: RecoveryParts, old_id: int, old: Submap)
 def _walk_to(gap: int, walk: Walk, parts: RecoveryParts) -> Steps[Walk]:
     """Walk again, no farther than to the frame before a gap.
 
-    Later walks go by the keyframes that an earlier one has left. From beyond a gap they would be tied to the crossing
-    of a young map. The grown one can cross more firmly.
+    By the keyframes that an earlier walk has left, the grown map can cross it more firmly.
     """
     job = walk.job
     attempt = next(attempt for attempt in (*parts.attempts, parts.posing) if attempt.name == walk.attempt)
@@ -155,8 +154,7 @@ def _walk_to(gap: int, walk: Walk, parts: RecoveryParts) -> Steps[Walk]:
 def _make_attempt(job: RecoveryJob, parts: RecoveryParts, attempt: Attempt, tries: LinkTries) -> Steps[Walk]:
     """Make one attempt, if the installation has what it takes.
 
-    If a pose beyond a gap is ambiguous, repeat it under the one that the velocities choose. If they choose none, repeat
-    it only as far as the gap.
+    If a pose beyond a gap is ambiguous, repeat it under the one that the velocities choose, or only as far as the gap.
     """
     if (lack := attempt.find_lack()) is not None:
         at = job.newest_id, job.submap.keyframes[job.newest_id].timestamp_s, job.submap.id
@@ -177,11 +175,7 @@ def _make_attempt(job: RecoveryJob, parts: RecoveryParts, attempt: Attempt, trie
 
 
 def _find_better(walk: Walk) -> tuple[Rival, ...]:
-    """Return what a walk that came to no link should have gone by beyond a gap, if the velocities tell.
-
-    Under a wrong pose it need not come to where a link is judged: a copy is not quite like the other. Then the ways in
-    the two maps say how these lie.
-    """
+    """Return what a walk that came to no link should have gone by beyond a gap, if the velocities tell."""
     if walk.link is not None or not walk.rivals:
         return ()
     if walk.choice is not None and walk.choice.is_measured:

@@ -1,10 +1,9 @@
 """Splitting of linked maps at a lost scale: a link holds only the part with the scale of its place.
 
-A map that has lost its scale and goes on may be joined to another by its later, healthy part: by sight, or by reverse
-tracking. What lies beyond the loss hangs on the joined map by nothing, and yet it would be posed in it, ten times too
-large. So each map that is linked is asked once more, at the end of the run, when all that it has seen is in it: from
-its links on, as far as it hands its scale on. The rest is split off as a submap of its own, with the links that stand
-there.
+A map that has lost its scale may be joined to another by its later, healthy part. What lies beyond the loss hangs on
+the joined map by nothing, and yet it would be posed in it. So each map that is linked is asked at the end of the run
+how far, from its links on, it hands its scale on. The rest is split off as a submap of its own, with the links that
+stand there.
 """
 
 from __future__ import annotations
@@ -29,14 +28,12 @@ from dualslam.recovery.scale_watch import FIRM_TIES, count_ties, lost_from
 
 
 def part_what_lost_its_scale(record: Record, submap_id: int, config: LinkingConfig, now: FrameStamp) -> None:
-    """Split off the part of a map beyond a loss of scale, seen from its links.
+    """Split off the part of a map beyond a loss of scale, seen from its links; without one it is left as it is.
 
-    A map without a link is left as it is: nothing says which of its parts is the right one. So is what other maps tie
-    together: the scale of either part is known there.
+    What other maps tie together stays: the scale of either part is known there.
 
     - `submap_id`: of a map that is archived.
     - `config`: says by how much a scale must be off to be wrong.
-    - `now`: for the event log.
     """
     submap = record.atlas.submaps[submap_id]
     held = _where_links_stand(record.atlas, submap_id) - submap.condemned

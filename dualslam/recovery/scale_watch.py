@@ -1,10 +1,9 @@
 """Whether a live map still hands its scale on: where it does not, what comes after is another map.
 
 A fast turn leaves few landmarks that both sides of it have seen. If their depths are hardly known, the scale behind the
-turn is another one. Yet every frame finds its inliers, and nothing looks wrong. The map's own normal equations show it
-(`linking/scale_observability.py`), once some keyframes behind the turn have seen the same: a verdict at once would cut
-a map at each turn on the spot, from which the camera comes back. They are solved at the desk: with workers in the
-background, and the verdict comes with a later keyframe.
+turn is another one, and yet every frame finds its inliers. The map's own normal equations show it
+(`linking/scale_observability.py`), once some keyframes behind the turn have seen the same. They are solved at the desk,
+in the background with workers.
 """
 
 from __future__ import annotations
@@ -77,7 +76,7 @@ def lost_from(config: LinkingConfig) -> float:
 class ScaleWatch:
     """Asks about each group of a live map's keyframes, once, when `BEHIND` have come after it.
 
-    What the map held when it was first seen is not tested: a link has gates of its own.
+    What the map held when it was first seen is not tested.
 
     - `config`: says by how much a scale must be off to be wrong.
     - `desk`: where the normal equations are solved; by default here and now.

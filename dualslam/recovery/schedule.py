@@ -124,13 +124,10 @@ class RetrySchedule:
 def as_far_as_it_leads(
     views: Iterable[View], poses: Mapping[int, FramePose], submap: Submap, linked: Collection[int]
 ) -> Iterator[View]:
-    """Yield the views, latest first, up to where only frames of another map follow.
-
-    What another map has posed, and all that is older, is not this one's to pose. Not so where the two are linked, as
-    far as this one has keyframes there as well.
+    """Yield the views, latest first, up to where only frames of another map follow, which are not this one's to pose.
 
     - `submap`: the one that the walk sets out from.
-    - `linked`: submaps that are one map with it.
+    - `linked`: submaps that are one map with it: as far as this one has keyframes there as well, their frames count.
     """
     oldest = min(submap.keyframes)
 
@@ -144,11 +141,10 @@ def as_far_as_it_leads(
 def way_to_gaps(views: Sequence[View], posed: Collection[int], keyframe_ids: Collection[int]) -> list[View]:
     """Return, of the views in the order of a walk, those without a pose that a keyframe leads to, and what leads there.
 
-    It begins with the last keyframe before the first of them, and ends with the last of them. Between gaps it goes by
-    the keyframes, and by the last frame before each gap.
+    It begins with the last keyframe before the first of them. Between gaps it goes by the keyframes, and by the last
+    frame before each gap.
 
-    - `posed`: frames that have a pose.
-    - `keyframe_ids`: the submap's.
+    `posed`: frames that have a pose. `keyframe_ids`: the submap's.
     """
     lacking = [view.index not in posed and view.index not in keyframe_ids for view in views]
     places = [i for i, view in enumerate(views) if view.index in keyframe_ids]

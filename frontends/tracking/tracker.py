@@ -336,10 +336,9 @@ class Tracker:
         return [*near, *(k for k in covering if k not in near)]
 
     def _refuse_look_alike(self, track: Track) -> Failure | None:
-        """Refuse a pose across a gap if another one explains nearly as much of what was seen before it.
+        """Refuse a pose across a gap if another one explains nearly as much of what the last keyframes saw before it.
 
-        That is asked of the last keyframes, in the descriptors that they saw. A gap beyond which two poses stood once
-        is not crossed any more: frames further on show ever less of what was seen, and one would pass by chance.
+        A gap beyond which two poses stood once is not crossed any more: farther on one would pass by chance.
         """
         if self._doubt is None:
             self._doubt = self._refuse_second_pose(

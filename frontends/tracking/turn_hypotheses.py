@@ -1,8 +1,7 @@
 """Relative poses whose rotation the far part of a scene shows by itself.
 
-A near plane can hide the far scene from a search over all matches. A pose that takes the turn for parallax puts far
-points in front of the camera, where the true one has none. So it wins the count. Here the rotation comes first, from a
-layer of matches that move as one turn does, and the translation from the others.
+Before a near plane, a pose that takes the turn for parallax puts far points in front of the camera, and wins the count.
+Here the rotation comes first, from a layer of matches that move as one turn does, then the translation from the others.
 """
 
 from __future__ import annotations

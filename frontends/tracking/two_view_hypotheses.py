@@ -1,8 +1,4 @@
-"""Relative poses that two matched views allow.
-
-From the turn that what is far shows by itself (`turn_hypotheses`); from an essential matrix; and for planes, from a
-homography.
-"""
+"""Relative poses that two matched views allow: by the turn of what is far, an essential matrix, a homography."""
 
 from __future__ import annotations
 
@@ -75,9 +71,8 @@ class RelativePoses:
     def of_plane(self, T_b_a: FloatArray) -> list[FloatArray]:
         """Return the four T_b_a of a homography, where it explains most of what the essential matrix' pose does.
 
-        Before a plane, the essential matrix is anyone's guess: a homography explains as much with less freedom. Only
-        the matches that the essential matrix explains are used. Wrong ones meet a line by chance, a point hardly ever.
-        Before a plane that repeats itself there are many.
+        Before a plane a homography explains as much with less freedom. Only the matches that the essential matrix
+        explains are used: wrong ones meet a line by chance, a point hardly ever.
         """
         uv_a, uv_b, variance = self._uv_a, self._uv_b, self._sigma_px**2
         gate_px = 3.0 * float(np.median(self._sigma_px))

@@ -1,7 +1,6 @@
 """The visual front end: frames in, keyframes of one submap out, in either direction of time.
 
-The same object tracks live frames and tracks in reverse. Reverse tracking starts at a new submap's first keyframe and
-goes through the buffer to an older submap. The only difference is the order of the frames.
+The same object tracks live frames and, given those of the buffer latest first, tracks in reverse.
 """
 
 from __future__ import annotations
@@ -112,8 +111,8 @@ class VisualFrontEnd:
     def grow_weak_start(self, noise2: float) -> None:
         """Triangulate what else the views of a start match, where its last view holds few landmarks.
 
-        A start holds only points that three views prove: often too few to find again over a wide step. Points of two
-        views help tracking at once. As at any keyframe, the mapper culls those that later keyframes do not see.
+        A start holds only points that three views prove. Points of two views help tracking at once; the mapper culls
+        them.
         """
         start = self._tracker.last
         assert start is not None, "start_at() comes first"
@@ -262,10 +261,9 @@ class VisualFrontEnd:
         `in_haste`: no patches are aligned. `pose_is_given`: its pose and covariance come from elsewhere, and count
         beside the landmarks that it sees.
 
-        What a pose places, it places to its own liking: new landmarks of a wrong one confirm it, and outvote the old
-        ones in the next frames. The keyframe is therefore posed by its matches before any is made: by a window of its
-        neighbours, or by the whole graph where these could be led astray. Where most of the matches are refused, the
-        frame's pose is wrong: the map is left without it.
+        New landmarks of a wrong pose would confirm it. The keyframe is therefore posed by its matches before any is
+        made: by a window of its neighbours, or by the whole graph where these could be led astray. Where most of the
+        matches are refused, the frame's pose is wrong: the map is left without it.
         """
         if pose_is_given:
             known = RelativePose(self._reference_id, self.relative_pose(track), track.covariance)

@@ -81,9 +81,7 @@ class ExportedMap:
 
     def scaled(self, factor: float) -> ExportedMap:
         """Return the same map with all lengths times `factor`."""
-        T = self.T_world_cam.copy()
-        T[:, :3, 3] *= factor
-        return replace(self, T_world_cam=T, xyz=self.xyz * factor)
+        return replace(self, T_world_cam=se3.scaled(self.T_world_cam, factor), xyz=self.xyz * factor)
 
 
 def read_stored(run: Path) -> StoredMap:
