@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from dualslam.core.camera.base import Camera
 from dualslam.core.interfaces import Frontend
-from dualslam.core.place_matcher import CELLS, Sighting
+from dualslam.core.matchers import CELLS, Sighting
 from dualslam.core.types import Features, FloatArray, IntArray, Matches
 from dualslam.frontends.features.matching import FeatureGrid, match_projected
 from dualslam.frontends.tracking.local_map import LocalMap
@@ -15,7 +15,7 @@ from dualslam.map.submap import Submap
 
 
 class FrontendPlaceMatcher:
-    """A front end as the verification of places asks it (`dualslam.core.place_matcher.PlaceMatcher`)."""
+    """A front end as the verification of places asks it (`dualslam.core.matchers.PlaceMatcher`)."""
 
     def __init__(self, frontend: Frontend, camera: Camera) -> None:
         self._frontend = frontend

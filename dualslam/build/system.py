@@ -48,8 +48,8 @@ from dualslam.frontends.tracking.visual import VisualFrontEnd
 from dualslam.lab.disturbances import FaultScript
 from dualslam.map.graph_beside import BesideGraphs
 from dualslam.map.lens import Calibration
-from dualslam.map.solving import open_graph
 from dualslam.map.submap import Submap
+from dualslam.map.submap_change import open_graph
 from dualslam.places.resemblance import find_resembling
 from dualslam.recovery.registration import MIN_PARALLAX_DEG
 from dualslam.system.state import Components

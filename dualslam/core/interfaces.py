@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from dualslam.core.bundle import FrameRows
 from dualslam.core.decisions import Ruling
 from dualslam.core.estimates import CalibrationEstimate, GraphEstimate, KeyframeReport
-from dualslam.core.pixels import PixelMatches, PosedImage
+from dualslam.core.matchers import PixelMatches, PosedImage
 from dualslam.core.types import (
     BoolArray,
     Failure,

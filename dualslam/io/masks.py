@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from dualslam.core.errors import InputError
 from dualslam.core.interfaces import Sequence
 from dualslam.core.types import BoolArray
-from dualslam.io.changed_frames import ChangedFrames
 from dualslam.io.images import list_images
+from dualslam.io.sequence import ChangedFrames
 
 log = logging.getLogger(__name__)
 

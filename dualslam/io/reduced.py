@@ -12,9 +12,9 @@ from dualslam.core.camera.base import Camera
 from dualslam.core.camera.focal import ToldFocal
 from dualslam.core.interfaces import Sequence
 from dualslam.core.types import Frame
-from dualslam.io.changed_frames import ChangedFrames
 from dualslam.io.decoding import UnreadableImageError
 from dualslam.io.images import ImageReader, ImageStore
+from dualslam.io.sequence import ChangedFrames
 
 MAX_SIDE_PX = 2048
 """Longer side of images that are read as they are. A frame has a thousand features whatever its size: an image of

@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import logging
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import closing, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from dualslam.core.camera.base import Camera
 from dualslam.core.camera.focal import ToldFocal
 from dualslam.core.errors import InputError
-from dualslam.core.types import FloatArray, Frame, IntArray
+from dualslam.core.interfaces import Sequence
+from dualslam.core.types import BoolArray, FloatArray, Frame, IntArray
 from dualslam.io.decoding import UnreadableImageError
 from dualslam.io.images import ImageReader, ImageStore
 from dualslam.io.read_ahead import read_ahead
@@ -239,3 +242,39 @@ def camera_of_size(camera: Camera, size_px: tuple[int, int], name: str, calibrat
         )
     log.warning("%s is for images of %s pixels: scaled to those of %s, %d x %d", calibration, was, name, width, height)
     return camera.resized(width, height)
+
+
+class ChangedFrames:
+    """Frames of another sequence, changed where they have an image.
+
+    - `change`: returns a frame as it is to be.
+    - `camera`: of the changed images, if it is another one.
+    - `hidden` (H, W) bool or None: the mask of all frames, if there is one.
+    """
+
+    def __init__(
+        self,
+        sequence: Sequence,
+        change: Callable[[Frame], Frame],
+        camera: Camera | None = None,
+        hidden: BoolArray | None = None,
+    ) -> None:
+        self._sequence, self._change = sequence, change
+        self.name, self.rate_hz = sequence.name, sequence.rate_hz
+        self.camera = camera or sequence.camera
+        if hidden is not None:
+            self.hidden = hidden
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("_"):
+            raise AttributeError(name)
+        return getattr(self._sequence, name)
+
+    def __len__(self) -> int:
+        return len(self._sequence)
+
+    def __iter__(self) -> Iterator[Frame]:
+        frames: Any = iter(self._sequence)
+        with closing(frames) if hasattr(frames, "close") else nullcontext():
+            for frame in frames:
+                yield frame if frame.image is None else self._change(frame)

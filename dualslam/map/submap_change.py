@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 
 import numpy as np
 
 from dualslam.core.geometry import se3, sim3, so3
+from dualslam.core.interfaces import SubmapGraph
 from dualslam.core.noise_model import GROUP
 from dualslam.core.types import FloatArray, IntArray
 from dualslam.map.submap import Submap
@@ -103,3 +104,28 @@ def _move_points(submap: Submap, before: Submap, known: IntArray, landmark_ids: 
     xyz = before.landmarks["xyz_mu"][ids]
     lm["xyz_mu"][ids] = np.einsum("nij,nj->ni", se3.rotation(of_each), xyz) + se3.translation(of_each)
     lm["distance_mu"][ids] *= scale
+
+
+def open_graph(submap: Submap, new_graph: Callable[[], SubmapGraph]) -> SubmapGraph:
+    """Return a graph of a submap as it is, solved in batch, from which covariances can be asked.
+
+    The submap stays as it is.
+
+    Raises `SolverError`.
+    """
+    graph = new_graph()
+    graph.rebuild(submap.copy(), near_optimum=True)
+    return graph
+
+
+def solve(submap: Submap, graph: SubmapGraph, near_optimum: bool = False) -> int:
+    """Solve a submap in a graph made anew, and drop what the solution contradicts; return how many observations.
+
+    `near_optimum`: whether its parts are solved already.
+
+    Raises `SolverError`.
+    """
+    estimate = graph.rebuild(submap, near_optimum)
+    submap.apply_estimate(*estimate.values)
+    submap.remove_outliers(estimate.outlier_rows)
+    return len(estimate.outlier_rows)

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from dualslam.core.geometry import se3, sim3
 from dualslam.core.geometry.alignment import estimate_sim3_robust
+from dualslam.core.matchers import PlaceMatcher, Sighting
 from dualslam.core.noise_model import GROUP, MIN_CONSENSUS, SAME_WITHIN, TINY
-from dualslam.core.place_matcher import PlaceMatcher, Sighting
 from dualslam.core.types import BoolArray, Failure, FloatArray, IntArray
 from dualslam.map.submap import Submap
 

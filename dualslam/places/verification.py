@@ -23,8 +23,8 @@ from numpy.random import Generator
 from dualslam.core.config.settings import LinkingConfig
 from dualslam.core.geometry import se3, sim3
 from dualslam.core.geometry.alignment import Sim3Estimate, estimate_sim3_robust
+from dualslam.core.matchers import PlaceMatcher, Sighting
 from dualslam.core.noise_model import MAJORITY, MIN_CONSENSUS, PROOF_VIEWS
-from dualslam.core.place_matcher import PlaceMatcher, Sighting
 from dualslam.core.types import Failure, FailureReason, Features, FloatArray, IntArray
 from dualslam.linking.join_test import (
     MAX_HYPOTHESES,

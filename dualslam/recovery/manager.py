@@ -24,10 +24,9 @@ from dualslam.core.types import Failure, FailureReason, LateFrame, View
 from dualslam.linking.join_test import judge_motion
 from dualslam.linking.motion import gaps_of, join_slack, seam_motions, step_motions
 from dualslam.map.lens import Calibration, rectified_where_possible
-from dualslam.map.solving import solve
 from dualslam.map.split import sound_copy
 from dualslam.map.submap import Submap
-from dualslam.map.submap_change import change_of_frame
+from dualslam.map.submap_change import change_of_frame, solve
 from dualslam.recovery.frame_buffer import FrameBuffer
 from dualslam.recovery.fusion import fuse, gauge_at_overlap, note_refused, pose_frames, tighten
 from dualslam.recovery.job import FoundLink, RecoveryJob, RecoveryResult, path_of

@@ -25,7 +25,7 @@ from dualslam.core.camera.models import PinholeCamera
 from dualslam.core.conformance import NotConforming, expect, run_checks
 from dualslam.core.geometry import se3
 from dualslam.core.interfaces import PixelMatcher
-from dualslam.core.pixels import PixelMatches, PosedImage
+from dualslam.core.matchers import PixelMatches, PosedImage
 from dualslam.core.types import FloatArray
 from dualslam.frontends.conformance.scene import PrintedPlane, transfer
 from dualslam.frontends.features.orb import OrbFrontend

@@ -14,7 +14,7 @@ from pydantic import Field
 from dualslam.core.camera.base import Camera
 from dualslam.core.config.problems import StrictModel
 from dualslam.core.geometry import se3, so3
-from dualslam.core.pixels import PixelMatches, PosedImage
+from dualslam.core.matchers import PixelMatches, PosedImage
 from dualslam.core.types import FloatArray
 from dualslam.frontends.direct.alignment import agreement, align, shift
 from dualslam.frontends.direct.patches import MAX_LEVELS, SHARP, Patches, Smear, patches_of, smears

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from dualslam.core.camera.base import Camera
 from dualslam.core.geometry import se3
-from dualslam.core.pixels import PosedImage
+from dualslam.core.matchers import PosedImage
 from dualslam.core.types import BoolArray, FloatArray, IntArray
 from dualslam.frontends.direct.warp import HALF, Pyramid, build_pyramid, inside, sample
 

@@ -14,8 +14,8 @@ from dualslam.core.camera.base import Camera
 from dualslam.core.errors import FrontendError
 from dualslam.core.geometry import se3
 from dualslam.core.interfaces import Frontend, PixelMatcher
+from dualslam.core.matchers import PixelMatches, PosedImage
 from dualslam.core.noise_model import TINY
-from dualslam.core.pixels import PixelMatches, PosedImage
 from dualslam.core.types import Failure, Features, FloatArray, FrameMethod, IntArray, Track, View
 from dualslam.frontends.features.found_features import features_found
 from dualslam.frontends.tracking.keyframe_images import KeyframeImages
@@ -159,7 +159,7 @@ def checked_matches(matcher: PixelMatcher, found: object) -> PixelMatches:
     """
     problem = None
     if not isinstance(found, PixelMatches):
-        problem = f"a {type(found).__name__}, not dualslam.core.pixels.PixelMatches"
+        problem = f"a {type(found).__name__}, not dualslam.core.matchers.PixelMatches"
     else:
         n = len(found.landmark_ids)
         if np.shape(found.uv_px) != (n, 2) or np.shape(found.sigma_px) != (n,):

@@ -12,7 +12,7 @@ from pydantic import Field
 
 from dualslam.core.camera.base import Camera
 from dualslam.core.config.settings import StrictModel
-from dualslam.core.pixels import PixelMatches, PosedImage
+from dualslam.core.matchers import PixelMatches, PosedImage
 from dualslam.core.types import FloatArray
 from dualslam.frontends.registry import MATCHERS, parse_options
 

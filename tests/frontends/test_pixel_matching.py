@@ -16,7 +16,7 @@ from dualslam.core.camera.base import Camera
 from dualslam.core.config.corruption import Corruption, CorruptionKind
 from dualslam.core.config.settings import Config, PixelsConfig, RecoveryConfig
 from dualslam.core.errors import ConfigError, FrontendError
-from dualslam.core.pixels import PixelMatches, PosedImage
+from dualslam.core.matchers import PixelMatches, PosedImage
 from dualslam.core.types import FloatArray, Frame, FrameMethod
 from dualslam.frontends.tracking.pixel_search import checked_matches
 from dualslam.lab.disturbances.images import corrupt_image

@@ -30,8 +30,8 @@ from dualslam.linking.scale_observability import (
     scale_sigmas_in_all,
 )
 from dualslam.linking.verify import judge_parting
-from dualslam.map.solving import solve
 from dualslam.map.submap import Submap
+from dualslam.map.submap_change import solve
 from dualslam.testing.link_worlds import (
     FRAME_STEP,
     Case,

@@ -21,8 +21,8 @@ from dualslam.core.jobs import InlineDesk, JobKind
 from dualslam.core.types import Failure, FailureReason, FrameStatus
 from dualslam.map.graph_beside import BesideGraph, BesideGraphs, GraphJob, GraphServer
 from dualslam.map.lens import change_camera
-from dualslam.map.solving import open_graph
 from dualslam.map.submap import Submap
+from dualslam.map.submap_change import open_graph
 from dualslam.map.submap_delta import SubmapMirror
 from dualslam.run.results import trajectories_of
 from dualslam.system.system import System

@@ -7,7 +7,7 @@ import numpy as np
 from dualslam.backend.submap_graph import ISam2SubmapGraph
 from dualslam.core.config.settings import GraphConfig, LinkingConfig
 from dualslam.linking import DescriptorMatcher, LinkEstimate, estimate_link
-from dualslam.map.solving import solve
+from dualslam.map.submap_change import solve
 from dualslam.recovery.fusion import gauge_at_overlap
 from dualslam.testing.link_worlds import hamming, make_case
 

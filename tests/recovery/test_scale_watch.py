@@ -13,9 +13,9 @@ from dualslam.core.jobs import Ended, InlineDesk, JobKind
 from dualslam.core.noise_model import GROUP
 from dualslam.core.types import Keyframe
 from dualslam.linking.scale_observability import N_AROUND
-from dualslam.map.solving import solve
 from dualslam.map.split import submap_of
 from dualslam.map.submap import Submap
+from dualslam.map.submap_change import solve
 from dualslam.recovery.scale_watch import BEHIND, SCALE_HANDLERS, ScaleLoss, ScaleWatch, count_ties
 from dualslam.run.results import trajectories_of
 from dualslam.system.system import System

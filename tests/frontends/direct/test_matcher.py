@@ -13,7 +13,7 @@ from dualslam.core.config.corruption import Corruption, CorruptionKind
 from dualslam.core.config.settings import Config, PixelsConfig
 from dualslam.core.errors import ConfigError
 from dualslam.core.geometry import se3, so3
-from dualslam.core.pixels import PixelMatches
+from dualslam.core.matchers import PixelMatches
 from dualslam.core.types import FloatArray
 from dualslam.frontends.conformance.scene import PrintedPlane, transfer
 from dualslam.frontends.direct.matcher import DirectMatcher
