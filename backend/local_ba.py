@@ -23,19 +23,13 @@ MAX_DEPTH_SIGMA = 1.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SubmapBundle:
-    """A `BundleResult` in a submap's ids: ``submap.apply_estimate(*bundle.estimate)`` takes it over.
+    """A `BundleResult` in a submap's ids: ``submap.apply_estimate(*bundle.estimate)`` takes it over."""
 
-    - `keyframe_ids` (F,) int64: the free ones first.
-    - `landmark_ids` (P,) int64.
-    - `rows` (R,) int64: rows of the submap's observation table, as in ``result.chi2``.
-    - `T_submap_frame` (G, 4, 4) float64: poses of the frames that took part.
-    """
-
-    keyframe_ids: IntArray
-    landmark_ids: IntArray
-    rows: IntArray
+    keyframe_ids: IntArray  # (F,): the free ones first
+    landmark_ids: IntArray  # (P,)
+    rows: IntArray  # (R,): rows of the submap's observation table, as in ``result.chi2``
     result: BundleResult
-    T_submap_frame: FloatArray
+    T_submap_frame: FloatArray  # (G, 4, 4): poses of the frames that took part
 
     @property
     def estimate(self) -> tuple[IntArray, FloatArray, IntArray, FloatArray]:

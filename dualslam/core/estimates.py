@@ -95,26 +95,18 @@ class CalibrationEstimate:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PreferredCamera:
-    """The camera that keyframes of a submap would rather have than the one that rectified their features.
+    """The camera that keyframes of a submap would rather have than the one that rectified their features."""
 
-    - `log_focal`: the logarithm of both focal lengths that their pixels ask for, less that of the camera's.
-    - `distance2`: squared Mahalanobis distance of the whole correction from the camera's.
-    - `beyond_chance`: whether the pixels contradict the camera.
-    - `keyframe_ids` (K,) int64.
-    - `T_now`, `T_preferred` (K, 4, 4): their poses by the same pixels alone, under the current camera and the preferred
-      one; each in a frame and unit of its own.
-    - `T_off` (N, K, 4, 4): those preferred, with the camera moved by one standard deviation of its own covariance, in
-      each independent direction. None if the camera is as it was given.
-    """
-
-    log_focal: float
+    log_focal: float  # logarithm of both focal lengths that their pixels ask for, less that of the camera's
     log_focal_sigma: float
-    distance2: float
-    beyond_chance: bool
-    keyframe_ids: IntArray
-    T_now: FloatArray
-    T_preferred: FloatArray
+    distance2: float  # squared Mahalanobis distance of the whole correction from the camera's
+    beyond_chance: bool  # whether the pixels contradict the camera
+    keyframe_ids: IntArray  # (K,) int64
+    T_now: FloatArray  # (K, 4, 4): their poses by the same pixels alone, in a frame and unit of its own
+    T_preferred: FloatArray  # (K, 4, 4): the same under the preferred camera
     T_off: FloatArray
+    """(N, K, 4, 4): those preferred, with the camera moved by one standard deviation of its own covariance, in each
+    independent direction. None if the camera is as it was given."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -143,15 +135,10 @@ class KeyframeReport:
 
 @dataclass(frozen=True, slots=True)
 class ReadoutEstimate:
-    """By how much longer images are read, from the first row to the last, than their features were corrected for.
+    """By how much longer images are read, from the first row to the last, than their features were corrected for."""
 
-    - `more_s`: negative: they are read for less long.
-    - `sigma_s`: its standard deviation, by the residuals' own noise.
-    - `n_keyframes`, `n_observations`: that gave it.
-    """
-
-    more_s: float
-    sigma_s: float
+    more_s: float  # negative: they are read for less long
+    sigma_s: float  # its standard deviation, by the residuals' own noise
     n_keyframes: int
     n_observations: int
 

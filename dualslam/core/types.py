@@ -209,14 +209,11 @@ class View:
 
 @dataclass(frozen=True, slots=True)
 class LateFrame:
-    """A frame that came too late to be tracked, and whose features are found only when a walk needs them.
-
-    `image`: without the pixels that show no scene.
-    """
+    """A frame that came too late to be tracked, and whose features are found only when a walk needs them."""
 
     index: int
     timestamp_s: float
-    image: GreyImage
+    image: GreyImage  # without the pixels that show no scene
 
     @property
     def nbytes(self) -> int:
@@ -245,42 +242,28 @@ class Matches:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Keyframe:
-    """A frame that the map keeps. Its pose and its landmarks belong to the submap, not to it.
+    """A frame that the map keeps. Its pose and its landmarks belong to the submap, not to it."""
 
-    - `id`: the index of its source frame: the same frame has the same keyframe id in every submap.
-    """
-
-    id: int
+    id: int  # the index of its source frame: the same frame has the same keyframe id in every submap
     timestamp_s: float
     features: Features
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Track:
-    """A posed frame.
-
-    - `T_cam_submap` (4, 4) float64.
-    - `T_predicted` (4, 4) float64: what the motion model said.
-    - `landmark_ids` (N,) int64: for each feature of the view the landmark it agrees with, or `NO_LANDMARK`.
-    - `visible_ids` (V,) int64: landmarks that the search expected to see; none where the pose came from elsewhere.
-    - `n_matches`, `n_inliers`: landmarks that were matched, and that agree with the pose.
-    - `chi2`: mean squared whitened residual per degree of freedom of the inliers.
-    - `wide`: whether guided matching failed and the pose came from wide matching.
-    - `covariance` (6, 6) float64: of `T_cam_submap`, for a left perturbation (rotation, translation).
-    - `n_by_pixels`: inliers that a pixel matcher found; the others are features that were matched.
-    """
+    """A posed frame."""
 
     view: View
-    T_cam_submap: FloatArray
-    T_predicted: FloatArray
-    landmark_ids: IntArray
-    visible_ids: IntArray
-    n_matches: int
-    n_inliers: int
-    chi2: float
-    wide: bool
-    covariance: FloatArray
-    n_by_pixels: int = 0
+    T_cam_submap: FloatArray  # (4, 4)
+    T_predicted: FloatArray  # (4, 4): what the motion model said
+    landmark_ids: IntArray  # (N,): for each feature of the view the landmark it agrees with, or `NO_LANDMARK`
+    visible_ids: IntArray  # (V,): landmarks that the search expected to see; none where the pose came from elsewhere
+    n_matches: int  # landmarks that were matched
+    n_inliers: int  # those that agree with the pose
+    chi2: float  # mean squared whitened residual per degree of freedom of the inliers
+    wide: bool  # whether guided matching failed and the pose came from wide matching
+    covariance: FloatArray  # (6, 6): of `T_cam_submap`, for a left perturbation (rotation, translation)
+    n_by_pixels: int = 0  # inliers that a pixel matcher found; the others are features that were matched
 
     @property
     def seen_ids(self) -> IntArray:
@@ -297,16 +280,11 @@ class Track:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Rival:
-    """Another answer to where a frame beyond a gap is, where what is seen there repeats itself.
+    """Another answer to where a frame beyond a gap is, where what is seen there repeats itself."""
 
-    - `index`: of the frame.
-    - `T_cam_rival`, `T_cam_walked` (4, 4) float64: ``T_cam_submap`` by the other answer, and by the one that was gone
-      by.
-    """
-
-    index: int
-    T_cam_rival: FloatArray
-    T_cam_walked: FloatArray
+    index: int  # of the frame
+    T_cam_rival: FloatArray  # (4, 4): ``T_cam_submap`` by the other answer
+    T_cam_walked: FloatArray  # (4, 4): the same by the one that was gone by
 
     @property
     def T_rival_walked(self) -> FloatArray:
@@ -316,20 +294,13 @@ class Rival:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Start:
-    """A verified start of a submap.
+    """A verified start of a submap."""
 
-    - `views`: first view, witnesses, last view, in the order in which they were given.
-    - `T_first_cam` (V, 4, 4) float64.
-    - `xyz` (N, 3) float64: in the first camera's frame; the median depth is 1.
-    - `feature` (V, N) int64: feature of each point in each view, or -1.
-    - `numbers`: the measures that the checks looked at.
-    """
-
-    views: list[View]
-    T_first_cam: FloatArray
-    xyz: FloatArray
-    feature: IntArray
-    numbers: dict[str, float]
+    views: list[View]  # first view, witnesses, last view, in the order in which they were given
+    T_first_cam: FloatArray  # (V, 4, 4)
+    xyz: FloatArray  # (N, 3): in the first camera's frame; the median depth is 1
+    feature: IntArray  # (V, N): feature of each point in each view, or -1
+    numbers: dict[str, float]  # the measures that the checks looked at
 
 
 class FailureReason(StrEnum):

@@ -71,16 +71,13 @@ class _Votes:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MatchedLandmarks:
-    """Pairs of landmarks, one to one, fixed by their views or not.
-
-    `pair_of_vote`: the pair of each vote, or -1 where it was not kept; `covariance_new`: of the new map's points.
-    """
+    """Pairs of landmarks, one to one, fixed by their views or not."""
 
     votes: _Votes
     landmark_old: IntArray
     landmark_new: IntArray
-    pair_of_vote: IntArray
-    covariance_new: FloatArray
+    pair_of_vote: IntArray  # the pair of each vote, or -1 where it was not kept
+    covariance_new: FloatArray  # of the new map's points
 
 
 def shared_keyframes(old: Submap, new: Submap) -> list[int]:

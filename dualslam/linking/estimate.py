@@ -232,17 +232,14 @@ def _link_over(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Consensus:
-    """A similarity with the keyframes (K,) and pairs (M,) that it stands on.
-
-    `seen`: the pairs that it was asked of; `change`: the first trusted keyframe that had to be left out.
-    """
+    """A similarity with the keyframes (K,) and pairs (M,) that it stands on."""
 
     estimate: Sim3Estimate
     votes: KeyframeVotes
     keyframes: BoolArray
-    seen: BoolArray
+    seen: BoolArray  # the pairs that it was asked of
     inliers: BoolArray
-    change: int | None
+    change: int | None  # the first trusted keyframe that had to be left out
 
     @property
     def inlier_ratio(self) -> float:

@@ -233,13 +233,10 @@ def _usual_error(known: _Fits, apart_s: float, of_before: float, of_after: float
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Lines:
-    """Straight lines through the frames on one side of each of N frames, itself included.
-
-    `place`: where they put the camera at the frame's time, (N, 3); where no line is known, the frame's own place.
-    """
+    """Straight lines through the frames on one side of each of N frames, itself included."""
 
     velocity: FloatArray
-    place: FloatArray
+    place: FloatArray  # (N, 3): where they put the camera at the frame's time; its own place where no line is known
     known: BoolArray
 
 

@@ -31,19 +31,13 @@ class SetJoin:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Shared:
-    """A place that two sets share, in their worlds.
-
-    - `keyframes` (int, int): one in either set.
-    - `S_a_b` (4, 4): between the two worlds.
-    - `T_b_cam` (4, 4): pose of the second keyframe.
-    - `within`: distance in the first world up to which another place says the same.
-    """
+    """A place that two sets share, in their worlds."""
 
     match: PlaceMatch
-    keyframes: tuple[int, int]
-    S_a_b: FloatArray
-    T_b_cam: FloatArray
-    within: float
+    keyframes: tuple[int, int]  # one in either set
+    S_a_b: FloatArray  # (4, 4): between the two worlds
+    T_b_cam: FloatArray  # (4, 4): pose of the second keyframe
+    within: float  # distance in the first world up to which another place says the same
 
     def agrees(self, other: _Shared) -> bool:
         """Whether another place puts its second keyframe where this one puts it."""

@@ -135,37 +135,29 @@ def refusal_data(attempt: str, old_id: int, why: Failure, **known: Any) -> dict[
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Attempt:
-    """One way to track in reverse, by the name of the front end that its poses come from.
-
-    `find_lack`: returns why the attempt cannot be made in this installation. It is asked before each attempt.
-    `max_unrecognised`: for an attempt that is only made if those before it leave something to do better. It ends at so
-    many frames in a row that show something and are not recognised.
-    """
+    """One way to track in reverse, by the name of the front end that its poses come from."""
 
     name: str
     new_odometry: Callable[[RecoveryJob, Submap, SubmapGraph], VisualOdometry]
-    find_lack: Callable[[], Failure | None] = lambda: None
+    find_lack: Callable[[], Failure | None] = lambda: None  # why it cannot be made in this installation, if so
     max_unrecognised: int | None = None
+    """For an attempt that is only made if those before it leave something to do better: it ends at so many frames in a
+    row that show something and are not recognised."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RecoveryParts:
-    """The parts of a recovery, built by the composition root of the process in which it runs.
-
-    `posing`: the way back where there is no lost map, but frames without a pose.
-    `find_camera`: asks keyframes of a map that a walk has grown about the camera.
-    `read`: finds the live front end's features in a frame that came too late.
-    `foresee`: precomputes the features that crossing a gap may need in a frame.
-    """
+    """The parts of a recovery, built by the composition root of the process in which it runs."""
 
     attempts: tuple[Attempt, ...]
-    posing: Attempt
+    posing: Attempt  # the way back where there is no lost map, but frames without a pose
     new_graph: Callable[[], SubmapGraph]
     matcher: DescriptorMatcher
     find_camera: Callable[[RecoveryJob, Submap, IntArray], PreferredCamera | None]
+    """Asks keyframes of a map that a walk has grown about the camera."""
     config: Config
-    read: Callable[[LateFrame, Camera], View | Failure]
-    foresee: Callable[[View], None] = lambda view: None
+    read: Callable[[LateFrame, Camera], View | Failure]  # finds the live features in a frame that came too late
+    foresee: Callable[[View], None] = lambda view: None  # precomputes what crossing a gap may need in a frame
 
     def link(self, old: Submap, new: Submap, onset: int | None) -> LinkEstimate | Failure:
         """Try to link a submap with an older one, which is suspected to be corrupted from a frame on."""

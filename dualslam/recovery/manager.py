@@ -45,15 +45,12 @@ class Loss:
 
 @dataclass(frozen=True, slots=True)
 class _UnderWay:
-    """A walk that has begun: when, with how many live keyframes, and whether it is not the submap's first.
-
-    `gone_on`: the submaps that were found again since, and are no more as the walk knows them.
-    """
+    """A walk that has begun: when, with how many live keyframes, and whether it is not the submap's first."""
 
     began_s: float
     n_live: int
     again: bool
-    gone_on: set[int] = field(default_factory=set)
+    gone_on: set[int] = field(default_factory=set)  # submaps that were found again since
 
 
 class Recoveries:

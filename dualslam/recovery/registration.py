@@ -41,21 +41,15 @@ GROWTH = 1.1
 
 @dataclass(slots=True)
 class Registration:
-    """Registers frames in one submap, which it changes.
-
-    - `views`: frames that may be registered, by their number.
-    - `alike`: for each frame and keyframe those that it resembles, the best first.
-    - `adjust`: adjusts some keyframes of the submap in place, and removes what does not fit.
-    - `watch`: receives the news of each frame that is registered.
-    """
+    """Registers frames in one submap, which it changes."""
 
     submap: Submap
-    views: dict[int, View]
-    alike: Mapping[int, list[int]]
+    views: dict[int, View]  # frames that may be registered, by their number
+    alike: Mapping[int, list[int]]  # for each frame and keyframe those that it resembles, the best first
     registrar: Registrar
-    adjust: Callable[[Submap, Collection[int]], None]
+    adjust: Callable[[Submap, Collection[int]], None]  # adjusts keyframes in place, removes what does not fit
     health: HealthConfig
-    watch: Callable[[WalkNews], None]
+    watch: Callable[[WalkNews], None]  # receives the news of each frame that is registered
     added: list[int] = field(default_factory=list)  # frames that were registered, in their order
     _tracks: dict[int, Track] = field(default_factory=dict)  # of frames that may be registered now
     _repeated: set[int] = field(default_factory=set)  # frames for which two poses stood

@@ -63,44 +63,33 @@ class State:
 
 @dataclass(frozen=True, slots=True)
 class Components:
-    """The parts that the composition root puts in: the system itself knows neither front end nor solver.
-
-    `keep`: what stays of a frame that came too late to be tracked. `new_relocaliser`: a front end that finds its submap
-    again wherever it is seen, and tracks from there. `walk_watch`: hears of reverse tracking that is under way. `desk`:
-    does the background work. `graphs`: carries changes to submaps' graphs in another process and back, if they are
-    solved there. `settle_ties`: bends a submap whose keyframes have come to share landmarks. `refine_at_end`: has the
-    last word on each submap.
-    `patches`: compares frames with the images of older keyframes. `open_graph`: makes a graph of a submap in this
-    process, solved. `open_features`: starts one more process, and returns a function that has the features of a frame
-    found there. `new_registrar`, `adjust`, `alike`: for `recovery/registration.py`. `match_wide`: as of `Frontend`.
-    `foresee`: precomputes in the background the features that reverse tracking may need. None without background
-    processes.
-    """
+    """The parts that the composition root puts in: the system itself knows neither front end nor solver."""
 
     view_of: Callable[[Frame], View | Failure]
-    keep: Callable[[Frame], LateFrame | Failure]
+    keep: Callable[[Frame], LateFrame | Failure]  # what stays of a frame that came too late to be tracked
     new_starter: Callable[[], MapStarter]
     new_graph: Callable[[], SubmapGraph]
     new_odometry: Callable[[Submap, SubmapGraph], Seeker]
-    new_relocaliser: Callable[[Submap, SubmapGraph], Seeker]
+    new_relocaliser: Callable[[Submap, SubmapGraph], Seeker]  # finds its submap wherever it is seen, goes on there
     calibration: Calibration
     shutter: Shutter
     scene: Scene
-    walk_watch: WalkWatch
+    walk_watch: WalkWatch  # hears of reverse tracking that is under way
     atlas_solver: AtlasSolver
-    settle_ties: SubmapAdjuster
-    refine_at_end: FinalRefiner
-    patches: PatchCheck
+    settle_ties: SubmapAdjuster  # bends a submap whose keyframes have come to share landmarks
+    refine_at_end: FinalRefiner  # has the last word on each submap
+    patches: PatchCheck  # compares frames with the images of older keyframes
     places: PlaceParts
     desk: ScheduledDesk
-    open_graph: Callable[[Submap], SubmapGraph]
-    new_registrar: Callable[[Submap], Registrar]
+    open_graph: Callable[[Submap], SubmapGraph]  # a graph of a submap in this process, solved
+    new_registrar: Callable[[Submap], Registrar]  # it, `adjust` and `alike`: for `recovery/registration.py`
     adjust: Callable[[Submap, Collection[int]], None]
     alike: Callable[[Mapping[int, Features], Collection[int], int], dict[int, list[int]]]
-    match_wide: Callable[[Features, Features], Matches]
-    graphs: BesideGraphs | None = None
+    match_wide: Callable[[Features, Features], Matches]  # as of `Frontend`
+    graphs: BesideGraphs | None = None  # carries changes to submaps' graphs in another process and back
     open_features: Callable[[], Callable[[Frame], Frame]] | None = None
-    foresee: Callable[[View], None] | None = None
+    """Starts one more process, and returns a function that has the features of a frame found there."""
+    foresee: Callable[[View], None] | None = None  # precomputes the features that reverse tracking may need
 
     @property
     def K(self) -> FloatArray:

@@ -74,10 +74,7 @@ class LayeredCamera(Camera):
 
 @dataclass(frozen=True)
 class CorrectedCamera(LayeredCamera):
-    """A camera whose rectified pixels are those of another, corrected. Made by `correct`.
-
-    - `base`: as it was given; `width` to `cy` are its own.
-    """
+    """A camera whose rectified pixels are those of another, corrected. Made by `correct`."""
 
     model: ClassVar[str] = "corrected"
 

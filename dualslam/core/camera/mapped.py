@@ -20,10 +20,7 @@ SAME_PX = 1.0
 
 @dataclass(frozen=True)
 class MappedCamera(LayeredCamera):
-    """A camera whose rays are its own, and whose rectified pixels are those of a map. Made by `camera_for_map`.
-
-    - `base`: `width` to `cy` are its own.
-    """
+    """A camera whose rays are its own, and whose rectified pixels are those of a map. Made by `camera_for_map`."""
 
     model: ClassVar[str] = "mapped"
 
