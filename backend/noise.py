@@ -40,10 +40,7 @@ def residual_variance(chi2: FloatArray, n_views: IntArray, least: float) -> floa
 
 
 class PixelNoise:
-    """Robust isotropic pixel noise, cached by its sigma: a pyramid has a handful of them.
-
-    `robust_k`: Huber threshold in sigmas.
-    """
+    """Robust isotropic pixel noise (`robust_k`: Huber threshold in sigmas), cached by its sigma."""
 
     def __init__(self, robust_k: float) -> None:
         self._loss = gtsam.noiseModel.mEstimator.Huber.Create(robust_k)

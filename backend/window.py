@@ -51,10 +51,7 @@ class NumpyWindowSolver:
         self._robust_k = robust_k
 
     def __call__(self, submap: Submap, free_keyframes: list[int]) -> GraphEstimate | Failure:
-        """Adjust a few keyframes, the newest first, and the points that the newest sees; the submap is not changed.
-
-        Keyframes of the submap's gauge stay fixed even if they are named.
-        """
+        """Adjust a few keyframes, but none of the gauge, and the points that the newest sees; return them."""
         start = time.thread_time()
         newest = free_keyframes[0]
         free = [k for k in free_keyframes if k not in submap.gauge and k in submap.keyframes]

@@ -71,10 +71,7 @@ def _spread(total: F32Image, weight: F32Image) -> F32Image:
 
 
 class SceneMask:
-    """Tells which pixels show the scene: those that a frame's own mask leaves, and that do not stand still.
-
-    `still`: looks for pixels that stand still; None: only the frames' own masks count.
-    """
+    """Tells which pixels show the scene: those that a frame's own mask leaves, and that do not stand `still`."""
 
     def __init__(self, still: StillPixels | None) -> None:
         self._still = still

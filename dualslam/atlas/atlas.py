@@ -152,9 +152,8 @@ class Atlas:
         return [link for link in self.links if not link.rejected]
 
     def components(self, sure: bool = False) -> list[list[int]]:
-        """Return the linked sets of submaps, each ascending, in order of their first submap.
-
-        `sure`: linked by connections whose scale may be relied on.
+        """Return the linked sets of submaps (`sure`: by sure connections), each ascending, in order of their first
+        submap.
         """
         return joined(self.submaps, [link for link in self.believed if link.is_sure or not sure])
 
@@ -167,10 +166,7 @@ class Atlas:
         return next(component for component in self.components(sure) if submap_id in component)
 
     def S_world_submap(self, component: list[int]) -> dict[int, FloatArray]:
-        """Return the transform of each submap of a linked set into the frame of its first one.
-
-        - `component`: submap ids; links that lead out of it are not followed.
-        """
+        """Return the transform of each submap of a linked set (`component`) into the frame of its first one."""
         found: dict[int, FloatArray] = {component[0]: np.eye(4)}
         if component[0] in self.placement:
             S_first_world = sim3.inverse(self.placement[component[0]])
@@ -214,10 +210,7 @@ def joined(submap_ids: Iterable[int], links: Iterable[Link]) -> list[list[int]]:
 
 
 def _present(submap: Submap, keyframe_id: int, shared: tuple[int, ...]) -> int:
-    """Return the keyframe of a submap at which a link is attached; where that was culled, the one in its place.
-
-    Where nothing is said of it, the submap's newest.
-    """
+    """Return the keyframe of a submap at which a link is attached, or its heir; by default the newest."""
     wanted = [keyframe_id] if keyframe_id >= 0 else sorted(shared, reverse=True)
     known = [k for k in wanted if k in submap.keyframes or k in submap.anchors]
     return submap.keyframe_for(known[0]) if known else max(submap.keyframes)

@@ -86,10 +86,7 @@ class Connections:
         return report
 
     def tighten(self, link: Link, now: FrameStamp) -> bool:
-        """Replace the unsure connection of the same kind between two submaps, if `link` is surer; say whether.
-
-        What it moves follows with the next solution.
-        """
+        """Replace the unsure connection of this kind between two submaps, if `link` is surer; return whether it is."""
         links = self._atlas.links
         ends = link.a, link.b, link.kind
         unsure = (i for i, known in enumerate(links) if (known.a, known.b, known.kind) == ends and not known.is_sure)
@@ -136,9 +133,8 @@ class Connections:
         return self._asked is not None or self._mover.is_moving
 
     def collect(self, now: FrameStamp) -> AtlasReport | None:
-        """Take in what has been solved meanwhile, and go on moving what it moves: the live submap first.
-
-        Returns AtlasReport or None: of connections that have waited for it.
+        """Take in what has been solved meanwhile, and go on moving; return the report on connections that have waited
+        for it.
         """
         self._mover.step()
         for ended in self._desk.poll(JobKind.ATLAS):

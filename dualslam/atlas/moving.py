@@ -35,9 +35,8 @@ class _Points:
 
 
 class Mover:
-    """Bends submaps with all that lies in them; a submap bends in one step, and its points are made better in others.
-
-    `record`, `solver`, `covariances`, `new_graph`, `front_ends`, `forget_graph`: see `Connections`.
+    """Bends submaps with all that lies in them, and makes their points better in later steps; arguments: see
+    `Connections`.
     """
 
     def __init__(

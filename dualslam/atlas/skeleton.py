@@ -207,9 +207,8 @@ def _joined_edges(a: AtlasEdges, b: AtlasEdges) -> AtlasEdges:
 
 
 def _are_torn(own: FloatArray, now: FloatArray, covariances: FloatArray) -> BoolArray:
-    """Whether two places of each pair were bent together that nothing tied at the time.
-
-    What they share now resulted from that, and the loop's own factor says it.
+    """Whether two places of each pair were bent together that nothing tied at the time: what they share resulted from
+    that.
     """
     off = sim3.log(sim3.inverse(own) @ now)
     return squared_distances(off, covariances) > CHI2_999[7]

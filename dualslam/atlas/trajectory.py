@@ -116,9 +116,8 @@ def compose(poses: Iterable[FramePose], atlas: Atlas, S_world_submap: dict[int, 
 
 
 class Worlds:
-    """The linked sets of an atlas, each with one world; composed anew only where a connection has come or moved.
-
-    `saved`: the submap whose frame is the world of the saved map that a run continues.
+    """The linked sets of an atlas, each with one world: that of a `saved` map, if one is continued, else its first
+    submap's.
     """
 
     def __init__(self, atlas: Atlas, saved: int | None = None) -> None:

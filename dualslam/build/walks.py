@@ -117,10 +117,7 @@ class _ImagesOf:
 
 
 def _auxiliaries(config: Config, n_threads: int) -> dict[str, _ImagesOf]:
-    """Return the front ends of the attempts by their settings. Attempts with the same settings share features.
-
-    Front ends that a run may do without are built when an attempt needs them: their packages take seconds to import.
-    """
+    """Return the front ends of the attempts by their settings, which share features; those may be built when needed."""
     auxiliaries: dict[str, _ImagesOf] = {}
     for number, attempt in enumerate(config.recovery.attempts):
         if attempt.is_live:

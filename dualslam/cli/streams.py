@@ -14,10 +14,7 @@ STDERR = 2
 
 
 class Lenient:
-    """A text stream that drops what cannot be written, once its reader has gone or its disk is full.
-
-    - `problem`: what was wrong first.
-    """
+    """A text stream that drops what cannot be written, once its reader has gone or its disk is full (`problem`)."""
 
     def __init__(self, stream: TextIO) -> None:
         self._stream = stream

@@ -93,10 +93,7 @@ class Decision:
 
 
 class DecisionSink:
-    """Passes decisions on to the listener, if there is one.
-
-    - `write`: called with each decision. None: decisions are not wanted, and are not made up either.
-    """
+    """Passes decisions on to the listener `write`, if there is one; else they are not made up either."""
 
     def __init__(self) -> None:
         self.write: Callable[[Decision], None] | None = None

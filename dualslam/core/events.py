@@ -88,10 +88,7 @@ _DECIDED = {
 
 
 class EventLog:
-    """Append-only list of events.
-
-    - `decisions`: receives the decisions of a run, those that events tell of included.
-    """
+    """Append-only list of events; `decisions` receives those of a run, with what events tell of."""
 
     def __init__(self) -> None:
         self._events: list[Event] = []

@@ -184,10 +184,7 @@ class Registrar(Protocol):
         ...
 
     def tie(self, find_alike: Callable[[Collection[int]], Mapping[int, list[int]]]) -> int:
-        """Let keyframes that resemble each other share the landmarks that both show; return how many features do.
-
-        `find_alike`: asks which keyframes each of some resembles.
-        """
+        """Let keyframes that `find_alike` names share the landmarks that both show; return how many features do."""
         ...
 
     def extend(self, keyframe_id: int, others: Collection[int]) -> None:

@@ -96,10 +96,7 @@ class Desk(Protocol):
     """Takes work on and gives results out, when its schedule says so."""
 
     def submit(self, kind: JobKind, work: Any, of: int | None = None) -> None:
-        """Take a job on; one too many ends at once, as a `Failure`.
-
-        `of`: the submap without which the answer is of no use.
-        """
+        """Take a job on, of use as long as submap `of` is; one too many ends at once, as a `Failure`."""
         ...
 
     def poll(self, kind: JobKind) -> list[Ended]:

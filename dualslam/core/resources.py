@@ -62,10 +62,7 @@ def keep_freed_memory() -> bool:
 
 
 def peak_rss_mb(with_children: bool = False) -> float:
-    """Return the highest resident memory of this process since it started, mebibytes.
-
-    `with_children`: and that of the largest of its children that have ended.
-    """
+    """Return the highest resident memory of this process, and of its largest child that has ended, mebibytes."""
     whose = (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN) if with_children else (resource.RUSAGE_SELF,)
     peak = sum(resource.getrusage(who).ru_maxrss for who in whose)
     return peak / MB if sys.platform == "darwin" else peak / 2**10

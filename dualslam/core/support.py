@@ -46,11 +46,7 @@ def support_gates(n_inliers: int, n_matches: int, chi2: float, config: HealthCon
 
 
 def judge_track(track: Track | Failure, config: HealthConfig) -> Track | Failure:
-    """Return the track if the map explains it, else why not.
-
-    - `track`: what the tracker made of a frame.
-    - `config`: thresholds, each with its meaning.
-    """
+    """Return the track if the map explains it, else why not."""
     if isinstance(track, Failure):
         return track
     lack = find_lack_of_support(track.n_inliers, track.n_matches, track.chi2, config)

@@ -38,11 +38,7 @@ class WalkNews:
 
 
 class WalkTrace:
-    """Where one attempt at a walk has been.
-
-    - `started_from` (3,): centre of the keyframe from which it sets out.
-    - `newest_id`: that keyframe.
-    """
+    """Where one attempt at a walk has been: from the keyframe `newest_id`, whose centre is `started_from` (3,)."""
 
     def __init__(self, submap_id: int, attempt: str, newest_id: int, started_from: FloatArray) -> None:
         self._submap_id, self._attempt = submap_id, attempt

@@ -105,10 +105,7 @@ def build_camera(lens: str, numbers: dict[str, float], where: str) -> Camera:
 
 
 def with_y_down(numbers: dict[str, Any], where: str) -> dict[str, Any]:
-    """Return a calibration whose y-axis points down: a negative fy (ICL-NUIM's is -480) says that it points up.
-
-    The image is the same.
-    """
+    """Return the same calibration with its y-axis down: a negative fy (ICL-NUIM's is -480) says that it points up."""
     fy = numbers.get("fy")
     if not isinstance(fy, int | float) or fy >= 0:
         return numbers

@@ -54,9 +54,8 @@ def save_arrays(path: str | Path, arrays: Arrays) -> None:
 def load_arrays(
     path: str | Path, names: Iterable[str] | None = None, optional: Iterable[str] = ()
 ) -> dict[str, NDArray[Any]]:
-    """Read an ``.npz`` of `save_arrays`, or some of its arrays; a file that would need unpickling is refused.
-
-    `optional`: arrays besides `names` that an earlier version did not write.
+    """Read an ``.npz`` of `save_arrays`, or some of its arrays and those `optional` ones that are there; never by
+    unpickling.
     """
     try:
         # Opened here, as numpy leaves the file open where it is no archive.

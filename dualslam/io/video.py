@@ -48,10 +48,7 @@ def open_recording(path: Path) -> Recording:
 
 
 class VideoFile:
-    """The frames of a video file.
-
-    - `timestamps_s` (N,) float64: presentation time of each frame in the file.
-    """
+    """The frames of a video file; `timestamps_s` (N,) float64: presentation time of each."""
 
     def __init__(self, path: Path) -> None:
         self.path = path

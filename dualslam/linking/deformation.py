@@ -43,9 +43,8 @@ def measure_deformation(
 
 
 def deformation_covariance(model: PairModel, deformation: float) -> FloatArray:
-    """Return (7, 7) that a deformation adds to a link's covariance (right perturbation, frame new).
-
-    All pairs bend together, in scale and in position relative to the landmarks' distance; orientation drifts less.
+    """Return (7, 7) that a deformation, which bends all pairs together, adds to a link's covariance (right
+    perturbation, new).
     """
     distance = np.linalg.norm(model.pairs.xyz_new[:, None] - model.T_new_kf[None, :, :3, 3], axis=2)
     sigma = np.repeat([ROTATION_SHARE, float(np.median(distance)), 1.0], [3, 3, 1]) * deformation

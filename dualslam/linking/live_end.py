@@ -170,10 +170,7 @@ def propagate_to_live_end(
 def _carry(
     link: LinkEstimate, new: Submap, lost: Bend, share: dict[str, float], evidence: LinkEvidence, refused: LinkRefusal
 ) -> LinkEstimate | LinkRefusal:
-    """Return a link with what the new map may have lost on the way to its live end, or its refusal.
-
-    The live end turns and grows about the place where the maps overlap.
-    """
+    """Return a link with what the new map may have lost on the way to its live end, or its refusal."""
     if not evidence.is_accepted:
         return refused
     held = [k for k in link.agreeing_keyframes.tolist() if k in new.keyframes]

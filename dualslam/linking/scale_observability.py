@@ -163,9 +163,8 @@ def answer_scale(question: ScaleQuestion) -> list[float]:
 
 
 def _directions(reduced: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the directions of the poses (6 F, n) that nothing fixes, and a root of the covariance of the others.
-
-    The gauge's directions are in neither.
+    """Return the directions of the poses (6 F, n) that nothing fixes, and a root of the covariance of others but the
+    gauge.
     """
     values, vectors = np.linalg.eigh(reduced)
     stiff = values[N_GAUGE:] > NO_TIE * float(np.median(values))

@@ -37,10 +37,7 @@ def _log_scale_at(model: PairModel, keyframes: IntArray) -> float:
 
 
 def judge_overlap(sigmas: dict[str, float], n_keyframes: int, config: LinkingConfig) -> LinkEvidence:
-    """Judge whether keyframes agree on a similarity, and the landmarks fix it (not collinear, nor all at one place).
-
-    `sigmas`: of `sigma_numbers`.
-    """
+    """Judge, by `sigma_numbers`, whether keyframes agree on a similarity, and the landmarks fix it."""
     position = sigmas["sigma_trans_mu"] / sigmas["depth_mu"]
     gates = similarity_gates(sigmas["sigma_scale"], sigmas["sigma_rot_deg"], position, config)
     return LinkEvidence.of([support_gate(n_keyframes, config.min_keyframes), *gates])

@@ -139,9 +139,8 @@ class Calibration:
         return self._estimate(submap, self._camera, self._covariance)
 
     def ask(self, submap: Submap, lost: dict[int, Submap]) -> CalibrationJob:
-        """Return the question to a submap, on copies of it and of those that are to change with it.
-
-        It is not due again before the submap has grown.
+        """Return the question to a submap, on copies of it and of those that are to change with it; the next is not due
+        at once.
         """
         self._asked(submap.id, len(submap.keyframes))
         copies = {m: each.copy() for m, each in lost.items()}
@@ -196,10 +195,7 @@ class Calibration:
         return numbers
 
     def update(self, submap: Submap, graph: SubmapGraph) -> Submap | Failure:
-        """Change a submap that an earlier camera made to the present one; return a copy of it as it was.
-
-        It was the same lens, and maps of different cameras have different shapes, which would not be linked.
-        """
+        """Change a submap that an earlier camera of the same lens made to the present one; return the old state."""
         try:
             return self._change(submap, self._camera, graph)
         except (InputError, SolverError) as error:

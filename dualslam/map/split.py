@@ -78,10 +78,7 @@ def take_out(submap: Submap, keyframe_ids: Iterable[int], anchor: int) -> None:
 
 
 def sound_copy(submap: Submap) -> Submap:
-    """Return a copy without the keyframes that are marked invalid, as long as others are left.
-
-    What these have seen of the others' landmarks would pair them with the wrong ones of another map.
-    """
+    """Return a copy without the keyframes that are marked invalid, as long as others are left."""
     twin = submap.copy()
     sound = twin.keyframes.keys() - twin.condemned
     if len(sound) >= 2 and twin.condemned:

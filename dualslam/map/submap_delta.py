@@ -124,9 +124,8 @@ class SubmapMirror:
         self._kept_rows = own if self._kept_rows is None else self._kept_rows[own]
 
     def delta(self, submap: Submap) -> SubmapDelta:
-        """Return what brings the replica up to date with a submap, and take it as done.
-
-        Where the camera has changed, or rows have left the table without the mirror's knowledge, it is made anew.
+        """Return what brings the replica up to date, or makes it anew if camera or rows have changed, and take it as
+        done.
         """
         renumbered = submap.n_dropped != self._n_dropped
         is_new = self._K is None or renumbered or bool((self._K != submap.K).any())

@@ -15,10 +15,7 @@ from dualslam.places.sightings import Relocalised, Search, Sighting, Sightings, 
 
 
 class Handover:
-    """Looks, where a keyframe is due, whether another submap has the place already.
-
-    `earlier`: the submaps that earlier runs have left.
-    """
+    """Looks, where a keyframe is due, whether a submap of the `earlier` runs has the place already."""
 
     def __init__(self, record: Record, sightings: Sightings, earlier: Set[int]) -> None:
         self._record = record
@@ -60,10 +57,7 @@ class Handover:
         return self._sighting is not None
 
     def _search_on(self, search: Search, track: Track, live: VisualOdometry) -> bool:
-        """Pose the newest frame by the next keyframe of a search; return whether the place was found, or may be yet.
-
-        Frames that are posed one by one cannot contradict each other: each says the same as the live map, or nothing.
-        """
+        """Pose the newest frame by the next keyframe of a search; return whether the place was found, or may be yet."""
         search.view = track.view
         as_before = all(self._record.atlas.submaps.get(m) is submap for m, submap in search.submaps.items())
         if as_before and self._sightings.go_on(search):

@@ -127,10 +127,7 @@ class Revisits:
         self._desk.submit(JobKind.LOOP, search, of=submap.id)
 
     def take_solution(self, live: VisualOdometry | None, now: FrameStamp) -> AtlasReport | None:
-        """Let the maps follow what has been solved meanwhile.
-
-        Returns AtlasReport or None: of the link that has waited for it.
-        """
+        """Let the maps follow what has been solved meanwhile; return the report on the link that has waited for it."""
         return self._closed(self._connections.collect(now), live, now)
 
     def _closed(self, report: AtlasReport | None, live: VisualOdometry | None, now: FrameStamp) -> AtlasReport | None:
@@ -140,9 +137,8 @@ class Revisits:
         return self._linked(closing, report, live, now)
 
     def collect(self, live: VisualOdometry | None, now: FrameStamp) -> AtlasReport | None:
-        """Take in the places found meanwhile, and link those that are sure.
-
-        Returns AtlasReport or None: of the link that was made.
+        """Take in the places found meanwhile, and link those that are sure; return the report on the link that was
+        made.
         """
         self._take_answers(self._desk.poll(JobKind.LOOP), live, now)
         waits = self._connections.foreseeing or self._connections.is_solving

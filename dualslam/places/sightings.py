@@ -67,10 +67,7 @@ class Relocalised:
 
 
 class Sightings:
-    """Shows frames to submaps that are not being tracked.
-
-    `new_relocaliser`: makes a front end of an archived submap.
-    """
+    """Shows frames to submaps that are not being tracked, in front ends that `new_relocaliser` makes."""
 
     def __init__(
         self,

@@ -100,10 +100,7 @@ class PlaceVerifier:
         self._seed = seed
 
     def verify(self, query: tuple[Submap, int], place: tuple[Submap, int]) -> PlaceMatch | Failure:
-        """Ask whether two keyframes, each with its submap, show one place.
-
-        `query`, `place` (Submap, int): the submaps may be one.
-        """
+        """Ask whether two keyframes, each with its submap (which may be one), show one place."""
         rng = np.random.default_rng([self._seed, query[1], place[0].id, place[1]])
         sides = self._sides(query, place)
         if isinstance(sides, Failure):

@@ -55,10 +55,7 @@ def fuse(
 def tighten(
     record: Record, connections: Connections, job: RecoveryJob, relinked: FoundLink, grown: Submap, now: FrameStamp
 ) -> None:
-    """Replace the link of two joined submaps where it was measured again, and its scale is known better.
-
-    `grown`: the job's submap in which it was measured.
-    """
+    """Replace the link of two joined submaps where `grown` has measured it again, and its scale is known better."""
     keyframe_ids = relinked.estimate.agreeing_keyframes.tolist()
     S_now_then = change_of_frame(grown, record.atlas.submaps[grown.id], keyframe_ids)
     link = _current(record, job.joined[relinked.old_id], grown.id, relinked, S_now_then)
@@ -194,10 +191,7 @@ def bypass(record: Record, recovered_frames: Collection[RecoveredFrame], new_id:
 
 
 def drop_corrupted(record: Record, old_id: int, since: int) -> int:
-    """Take the pose from frames of the corrupted tail that the walk has skipped: that of the old map may be wrong.
-
-    They keep their row.
-    """
+    """Take the pose from frames of the corrupted tail that the walk has skipped: that of the old map may be wrong."""
     poses = record.poses
     corrupted = [i for i, pose in poses.items() if pose.submap_id == old_id and i >= since]
     for i in corrupted:
@@ -222,10 +216,7 @@ def condemn_tail(
 
 
 def link_overlaps(record: Record, connections: Connections, config: Config, own: Set[int], now: FrameStamp) -> None:
-    """Link the submaps of each set where they hold the same keyframes, when the run is over.
-
-    `own`: the submaps of this run.
-    """
+    """Link a run's `own` submaps of each set where they hold the same keyframes, when the run is over."""
     with record.timer.measure("overlaps"):
         for component in record.atlas.components():
             if links := list(_overlaps(record, [m for m in component if m in own], config)):

@@ -146,10 +146,7 @@ def question_about(submap: Submap, ids: IntArray, before: IntArray, after: IntAr
 
 
 def count_ties(submap: Submap, ids: IntArray, end: int, begin: int, n_views: int = 1) -> int:
-    """Return how many landmarks are seen by `n_views` or more of the keyframes before `end`, and from `begin` on.
-
-    Far ones, whose depth is hardly known, are not counted.
-    """
+    """Return how many landmarks that are not far are seen by `n_views` keyframes before `end`, and from `begin` on."""
     sides = ids[max(end - N_AROUND, 0) : end].tolist(), ids[begin : begin + N_AROUND].tolist()
     before, after = (submap.n_views_among(side) for side in sides)
     tied = (before >= n_views) & (after >= n_views)

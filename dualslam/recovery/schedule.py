@@ -24,10 +24,7 @@ def tightened(max_sigma: float, n_tries: int) -> float:
 
 
 class LinkTries:
-    """Results of earlier tries at linking each lost map, over all walks and attempts.
-
-    - `refused`: by lost map, the tries that were refused for the scale.
-    """
+    """Results of earlier tries at linking each lost map; `refused`: by lost map, those refused for the scale."""
 
     def __init__(self, refused: Mapping[int, int] | None = None) -> None:
         self.refused: Counter[int] = Counter(refused)

@@ -24,10 +24,7 @@ POSED = frozenset({FrameStatus.TRACKED, FrameStatus.RECOVERED, FrameStatus.BYPAS
 
 
 class SampleKeeper:
-    """Watches a run, and keeps of each gap the last frame before it, its first and last one, and the first after it.
-
-    `keep`: given the frame's index and a JPEG, as soon as a gap is over.
-    """
+    """Watches a run, and keeps a JPEG of each gap's last frame before, first and last one, and the first after it."""
 
     def __init__(self, keep: Callable[[int, bytes], None]) -> None:
         self._keep = keep
@@ -65,10 +62,7 @@ class SampleKeeper:
 
 
 class PlaceAlbum:
-    """Remembers what the camera has seen, so that a revisited place can be shown then and now.
-
-    `keep`: given the frame's index and a JPEG, once a place is revisited.
-    """
+    """Remembers what the camera has seen, and keeps JPEGs of a revisited place, then and now."""
 
     def __init__(self, keep: Callable[[int, bytes], None]) -> None:
         self._keep = keep

@@ -150,10 +150,7 @@ def run_sequence(
 
 
 class _Steps:
-    """Gives a system one frame after the other, and notes how long each took and what ended them.
-
-    `schedule`: of a run in real time, else None.
-    """
+    """Gives a system one frame after the other (in real time by a schedule), and notes how long each took."""
 
     def __init__(
         self,

@@ -103,10 +103,7 @@ def as_recorded(frames: Iterator[Frame], recorded: Recorded) -> Iterator[Handed]
 def prepared(
     handed: Iterator[Handed], prepare: Callable[[Frame], Frame] | None, schedule: Schedule, clock: Callable[[], float]
 ) -> Iterator[Handed]:
-    """Prepare the frames: the next one is begun when the last was taken.
-
-    One that comes in time finds nothing else to be done: it goes as it is, and leaves the other cores alone.
-    """
+    """Prepare the frames that are late: the next one is begun when the last was taken."""
     if prepare is None:
         return handed
 

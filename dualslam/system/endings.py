@@ -32,10 +32,7 @@ ROOM_TO_COME_BACK = 1.2
 
 
 class Endings:
-    """Archives live maps, and continues in the next where the end is no loss.
-
-    `earlier`: the submaps that earlier runs have left.
-    """
+    """Archives live maps, and continues in the next (`earlier`: those of earlier runs) where the end is no loss."""
 
     def __init__(
         self, state: State, recoveries: Recoveries, connections: Connections, sightings: Sightings, earlier: Set[int]

@@ -135,10 +135,7 @@ class Refinder:
         return track
 
     def _sought(self, track: Track, looked_for: IntArray, pose_prior: _PosePrior | None) -> list[_Sought]:
-        """Return the landmarks of the rim that the frame lacks, each in the keyframe next to the gap that sees it.
-
-        Of these, the ones whose depths (and beyond a gap, whose places in the frame) are known; and none twice.
-        """
+        """Return the landmarks of the rim, of known depth and place, that the frame lacks, once, next to the gap."""
         submap, taken = self._submap, np.concatenate([track.landmark_ids, looked_for])
         pose_covariance = None if pose_prior is None else self._pose_covariance(track, pose_prior)
         found = []

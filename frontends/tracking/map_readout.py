@@ -36,10 +36,7 @@ left (1.4, 1.7, 1.9 of 1.95 ms)."""
 
 @dataclass(slots=True, eq=False)
 class ReadoutQuestion:
-    """F keyframes, N points, R observations; the poses, points and readout time are what is estimated.
-
-    It can be pickled.
-    """
+    """F keyframes, N points, R observations; poses, points and readout time are estimated. It can be pickled."""
 
     K: FloatArray
     T_cam_submap: FloatArray  # (F, 4, 4)

@@ -37,10 +37,7 @@ def _largest(features: Features) -> Features:
 
 
 class TurnMeter:
-    """How the camera turns from frame to frame, by matches.
-
-    - `between_rad_s` (3,) float64 or None: between the two last views; None if unknown.
-    """
+    """How the camera turns, by matches; `between_rad_s` (3,) or None: between the two last views."""
 
     def __init__(self, frontend: Frontend) -> None:
         self._frontend = frontend

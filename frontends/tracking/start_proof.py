@@ -64,10 +64,7 @@ class StartProof:
         self._seed = seed
 
     def verify(self, pair: ViewPair, views: list[View]) -> Start | Failure:
-        """Return the start that two views make, with the views between them that have proven it.
-
-        `views`: the first, those between, and the last.
-        """
+        """Return the start that two views make, with the views between them (`views` has all) that have proven it."""
         good = np.flatnonzero(pair.good)
         xyz = pair.xyz[good]
         feature = np.full((len(views), len(good)), -1, np.int64)

@@ -128,10 +128,7 @@ class Tracker:
         self.refresh()
 
     def track(self, view: View, may_relocalise: bool = True) -> Track | Failure:
-        """Pose a frame. A failure leaves the tracker as it was, so that the next frame may succeed.
-
-        `may_relocalise`: match it with whole keyframes where guided matching fails.
-        """
+        """Pose a frame, also by whole keyframes if it `may_relocalise`; a failure leaves the tracker as it was."""
         assert self._last is not None, "start() comes first"
         features = view.features
         if len(features) < self._config.min_inliers and self._pixels is None:
@@ -185,10 +182,7 @@ class Tracker:
         return self._look_for(self._near_map(view.index), view, pose)
 
     def track_near(self, view: View, T_cam_submap: FloatArray) -> Track | Failure:
-        """Pose a frame by the landmarks of the keyframes nearest in time, from a pose that is near its own.
-
-        The tracker continues from there only after `take`.
-        """
+        """Pose a frame by the landmarks of the keyframes nearest in time, from a pose near its own; see `take`."""
         local, grid = self._near_map(view.index), FeatureGrid.build(view.features.uv_rect_px)
         nothing = np.full(len(view.features), NO_LANDMARK, np.int64)
         return self._pose_from_local_map(local, view, grid, T_cam_submap, nothing, T_cam_submap, wide=True)

@@ -225,10 +225,7 @@ class VisualFrontEnd:
         return ruling
 
     def go_by_known(self, track: Track) -> None:
-        """Go by the keyframe of an earlier run that is there for a frame which would have become one.
-
-        A map that is used many times has so as many keyframes as its place needs.
-        """
+        """Go by the keyframe of an earlier run that makes one of this frame superfluous."""
         if not self._first_id or not self._shows_other(track):
             return
         known = self._known(track)

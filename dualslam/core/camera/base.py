@@ -247,8 +247,5 @@ def rectify(features: Features, camera: Camera, model_sigma_px: float) -> Featur
 
 
 def rectified_sigma(sigma_px: FloatArray, magnification: FloatArray, model_sigma_px: float) -> FloatArray:
-    """Return the noise (N,) of rectified pixels, from that of the raw ones and the camera model's error.
-
-    In steps of an eighth of an octave: the graph shares one noise model among all pixels of one sigma.
-    """
+    """Return the noise (N,) of rectified pixels, in eighths of an octave: the graph shares one noise model by sigma."""
     return np.asarray(2.0 ** (np.rint(8.0 * np.log2(np.hypot(sigma_px, model_sigma_px) * magnification)) / 8.0))

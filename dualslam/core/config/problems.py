@@ -26,11 +26,7 @@ _PLAIN_WORDS = {
 
 
 def sentence(error: ValidationError, root: type[BaseModel]) -> str:
-    """Return what is wrong with the first field that is, and how many more are.
-
-    - `error`: of pydantic.
-    - `root`: the model that was to be made.
-    """
+    """Return what is wrong with the first field of the model `root` that is, and how many more are."""
     problems = error.errors(include_url=False)
     more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
     return _of_one(problems[0], tuple(problems[0]["loc"]), root) + more

@@ -316,9 +316,8 @@ class CalibrationConfig(StrictModel):
 
     @property
     def max_focal_sigma(self) -> float:
-        """Sigma of the log focal length up to which it counts as observed: a fifth of its prior's.
-
-        In a right-angled bend 1 % of focal length costs 10 % of scale and more.
+        """Sigma of the log focal length up to which it counts as observed: 1 % of focal length is 10 % of scale in a
+        bend.
         """
         return 0.2 * self.log_focal_sigma
 

@@ -59,10 +59,7 @@ def undistorted(
     numbers: Mapping[int, int],
     mask: NDArray[np.uint8] | None = None,
 ) -> Iterator[tuple[int, NDArray[np.uint8], NDArray[np.uint8]]]:
-    """Yield the row of each view that has an image, the image without the lens, and its mask (0 is ignored).
-
-    Parameters as of `with_images`.
-    """
+    """Yield, as `with_images` has them, the row of each view with an image, that without the lens, and its mask."""
     row_of = exported.rows_by_index(numbers)
     maps: dict[int, tuple[NDArray[np.float32], NDArray[np.float32]]] = {}
     valid: dict[int, NDArray[np.uint8]] = {}

@@ -42,11 +42,7 @@ class Stretch:
 
 
 class PhotometricAudit:
-    """Compares tracked frames with the patches of older keyframes, a few times a second.
-
-    - `repeated`: frames whose image is that of the frame before: the camera hung, or the video was made from fewer
-      frames.
-    """
+    """Compares tracked frames, but for those `repeated`, with the patches of older keyframes, a few times a second."""
 
     def __init__(self, patches: PatchCheck) -> None:
         self._patches = patches

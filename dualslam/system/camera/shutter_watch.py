@@ -38,10 +38,7 @@ MAX_GAP_S = 0.2
 
 
 def turn_rates(submap: Submap, poses: Iterable[FramePose]) -> dict[int, FloatArray]:
-    """Return how the camera turns at the frames that a submap has posed (rad/s, in its own axes), by their index.
-
-    `poses`: in any order; those of other submaps are left out.
-    """
+    """Return how the camera turns at the frames that a submap has posed (rad/s, in its own axes), by their index."""
     posed = sorted((p for p in poses if p.submap_id == submap.id), key=attrgetter("index"))
     if len(posed) < 2:
         return {}
