@@ -139,9 +139,7 @@ class Calibration:
         return self._estimate(submap, self._camera, self._covariance)
 
     def ask(self, submap: Submap, lost: dict[int, Submap]) -> CalibrationJob:
-        """Return the question to a submap, on copies of it and of those that are to change with it; the next is not due
-        at once.
-        """
+        """Return the question to a submap, on copies of it and of those that are to change with it."""
         self._asked(submap.id, len(submap.keyframes))
         copies = {m: each.copy() for m, each in lost.items()}
         return CalibrationJob(submap.copy(), copies, self._camera, self._covariance)
