@@ -19,6 +19,8 @@ from dualslam.map.submap import Submap
 
 MAX_DEPTH_SIGMA = 1.0
 """A point whose distance is known no better than this (relative, one sigma) is not adjusted."""
+ITERATIONS = 5
+"""Of `adjust_and_prune`."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -151,9 +153,6 @@ def bundle_adjust(
     T_submap_frame = result.T_submap_kf[n:]
     result = replace(result, T_submap_kf=result.T_submap_kf[:n], chi2=result.chi2[:n_rows])
     return SubmapBundle(keyframes, landmarks, rows, result, T_submap_frame)
-
-
-ITERATIONS = 5
 
 
 def adjust_and_prune(

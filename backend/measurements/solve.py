@@ -21,6 +21,10 @@ MAX_REJECTED = 0.4
 """Share of readings of a kind that may be outvoted: beyond, it is not known who is wrong."""
 MISREAD = 2.0 * float(np.log(1000.0))
 """Difference of costs, twice a logarithm of likelihoods: one file in a thousand is wrong in a given way."""
+FOOT_M = 0.3048
+Misreading = tuple[str, list[MeasurementSource], float]
+"""What is wrong, in words; the sources without the mistake; what is to be added to their cost. A density whose sigmas
+are in a larger unit is lower: the addition is twice the logarithm of the factor."""
 
 
 def solve_metric(
@@ -76,14 +80,6 @@ def _check(solution: MetricSolution, joint: JointGraph, names: str) -> None:
                 f"{name}: its clock would be {offset:+.1f} s off, more than {MAX_OFFSET_S:.0f} s: give --clock-offset, "
                 "or the file of this recording."
             )
-
-
-FOOT_M = 0.3048
-
-
-Misreading = tuple[str, list[MeasurementSource], float]
-"""What is wrong, in words; the sources without the mistake; what is to be added to their cost. A density whose sigmas
-are in a larger unit is lower: the addition is twice the logarithm of the factor."""
 
 
 def misreadings(sources: Sequence[MeasurementSource], jumps_s: Mapping[int, float]) -> Iterator[Misreading]:

@@ -16,6 +16,9 @@ from dualslam.core.camera.base import Camera
 from dualslam.core.types import FloatArray, Keyframe
 from dualslam.map.submap import NO_LANDMARK, Submap
 
+MAX_EARLIER_FRAMES = 100_000
+"""Frames of earlier runs whose poses a map keeps, the newest: an hour of 30 Hz, 16 MB. All are in the run folders."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StoredMap:
@@ -38,10 +41,6 @@ class StoredMap:
     def main(self) -> list[int]:
         """The linked set of submaps with most posed frames: its first one's frame is the world of the saved run."""
         return self.atlas.largest(Counter(pose.submap_id for pose in self.poses.values()))
-
-
-MAX_EARLIER_FRAMES = 100_000
-"""Frames of earlier runs whose poses a map keeps, the newest: an hour of 30 Hz, 16 MB. All are in the run folders."""
 
 
 def tidy(atlas: Atlas, poses: Mapping[int, FramePose]) -> dict[int, FramePose]:

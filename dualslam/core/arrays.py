@@ -14,6 +14,8 @@ from dualslam.core.types import BoolArray, FloatArray, IntArray
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
+ColumnsT = TypeVar("ColumnsT", bound="DataclassInstance")
+
 
 def is_first(values: IntArray) -> BoolArray:
     """Return (N,) which values have none like them before them."""
@@ -55,9 +57,6 @@ def quantile(values: FloatArray, share: float) -> FloatArray:
     below, above = parted[low], parted[high]
     between = above - (above - below) * (1.0 - t) if t >= 0.5 else below + (above - below) * t
     return np.asarray(between, np.float64)
-
-
-ColumnsT = TypeVar("ColumnsT", bound="DataclassInstance")
 
 
 def concatenate(parts: Sequence[ColumnsT]) -> ColumnsT:

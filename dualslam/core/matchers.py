@@ -13,6 +13,11 @@ from dualslam.core.types import Features, FloatArray, IntArray, Matches
 if TYPE_CHECKING:
     from dualslam.map.submap import Submap
 
+CELLS = 4
+"""Parts of an image along either axis."""
+MIN_IN_CELL = 5
+"""Landmarks that a part must be expected to show to have a say."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PosedImage:
@@ -41,12 +46,6 @@ class PixelMatches:
 
     def __len__(self) -> int:
         return len(self.landmark_ids)
-
-
-CELLS = 4
-"""Parts of an image along either axis."""
-MIN_IN_CELL = 5
-"""Landmarks that a part must be expected to show to have a say."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -14,6 +14,13 @@ LIMITS = {
     "NUMEXPR_NUM_THREADS": "1",
     "OPENCV_FOR_THREADS_NUM": "1",
 }
+MB = 2**20
+M_TRIM_THRESHOLD, M_MMAP_THRESHOLD, M_ARENA_MAX = -1, -3, -8
+"""As in glibc's `malloc.h`."""
+KEPT_BYTES = 256 * MB
+"""So much at most lies idle; SIFT's scale space of a KITTI image takes 110 MB."""
+LARGEST_BYTES = 32 * MB
+"""Larger arrays are given back all the same: glibc allows no more."""
 
 
 def limit_threads() -> bool:
@@ -33,15 +40,6 @@ def spare_cores(n_busy: int) -> int:
     """Return how many of the cores that this process may use are left beside so many busy ones."""
     usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     return max(0, usable - n_busy)
-
-
-MB = 2**20
-M_TRIM_THRESHOLD, M_MMAP_THRESHOLD, M_ARENA_MAX = -1, -3, -8
-"""As in glibc's `malloc.h`."""
-KEPT_BYTES = 256 * MB
-"""So much at most lies idle; SIFT's scale space of a KITTI image takes 110 MB."""
-LARGEST_BYTES = 32 * MB
-"""Larger arrays are given back all the same: glibc allows no more."""
 
 
 def keep_freed_memory() -> bool:

@@ -20,6 +20,28 @@ from dualslam.linking.motion import Motion
 MAX_DRIFT, MAX_DRIFT_DEG, MAX_DRIFT_LOG_SCALE = 0.5, 60.0, math.log(3.0)
 """Largest drift of a map between two places, if it was never lost there: a share of the way, a turn, a log-scale. Two
 neighbouring copies of a thing are half the way apart. The largest drift of a real sequence is 47 % in scale."""
+PAIR_CHI2 = CHI2_99[3]
+"""Gate of a matched pair's squared Mahalanobis distance: chi-square, 3 degrees of freedom, 99 %."""
+PIXEL_CHI2 = CHI2_99[2]
+"""Gate of a squared whitened reprojection residual: chi-square, 2 degrees of freedom, 99 %."""
+MIN_PAIRS_PER_KEYFRAME = 8
+"""Matched landmarks that a keyframe must hold to have a say (four fix a similarity with one to spare)."""
+MAX_MISFITS = 1
+"""Keyframes in a row that may disagree before this counts as a change point: one can be wrong by itself."""
+MIN_TIES = 10
+"""Landmarks that keyframes on both sides of a place in the old map must see in agreement with their pixels. With fewer
+the old map is broken there, and its newer part counts as suspected."""
+LOOK_BACK = 2 * GROUP
+"""Keyframes of the old map, older than the oldest shared one, among which a break is still looked for."""
+MINORITY_DEFORMATION = 0.03
+"""Relative deformation (standard deviation) of a map beyond a place where it hands on fewer than half of what its
+keyframes see. Where an occluder comes in, maps of rendered worlds lost up to 8 % of their scale and claimed 0.9 %."""
+MIN_IMAGE_SPREAD = 0.25
+"""Share of the image, along either axis, that 90 % of the agreeing landmarks must cover, of the keypoints' own."""
+MAX_SCALE = 50.0
+"""Largest scale, and inverse of the smallest: that is the ratio of the depths at the submaps' starts."""
+MAX_HYPOTHESES = 512
+"""Triplets that RANSAC draws at most."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -205,27 +227,3 @@ def motion_gate(motion: Motion) -> JoinGate:
     compared = (Gate("leap_off", motion.off_mu, "<=", motion.allowed_mu),)
     logged = {"leap_usual": motion.usual_mu, "leap_asked": float(motion.n_asked)}
     return JoinGate(compared, FailureReason.LEAP, detail, logged=logged)
-
-
-PAIR_CHI2 = CHI2_99[3]
-"""Gate of a matched pair's squared Mahalanobis distance: chi-square, 3 degrees of freedom, 99 %."""
-PIXEL_CHI2 = CHI2_99[2]
-"""Gate of a squared whitened reprojection residual: chi-square, 2 degrees of freedom, 99 %."""
-MIN_PAIRS_PER_KEYFRAME = 8
-"""Matched landmarks that a keyframe must hold to have a say (four fix a similarity with one to spare)."""
-MAX_MISFITS = 1
-"""Keyframes in a row that may disagree before this counts as a change point: one can be wrong by itself."""
-MIN_TIES = 10
-"""Landmarks that keyframes on both sides of a place in the old map must see in agreement with their pixels. With fewer
-the old map is broken there, and its newer part counts as suspected."""
-LOOK_BACK = 2 * GROUP
-"""Keyframes of the old map, older than the oldest shared one, among which a break is still looked for."""
-MINORITY_DEFORMATION = 0.03
-"""Relative deformation (standard deviation) of a map beyond a place where it hands on fewer than half of what its
-keyframes see. Where an occluder comes in, maps of rendered worlds lost up to 8 % of their scale and claimed 0.9 %."""
-MIN_IMAGE_SPREAD = 0.25
-"""Share of the image, along either axis, that 90 % of the agreeing landmarks must cover, of the keypoints' own."""
-MAX_SCALE = 50.0
-"""Largest scale, and inverse of the smallest: that is the ratio of the depths at the submaps' starts."""
-MAX_HYPOTHESES = 512
-"""Triplets that RANSAC draws at most."""

@@ -12,6 +12,9 @@ from dualslam.core.noise_model import GROUP
 from dualslam.core.types import FloatArray, IntArray
 from dualslam.map.submap import Submap
 
+N_NEAREST = 3
+"""Keyframes that a newer one follows: one alone may have been moved by its own noise."""
+
 
 def change_of_frame(
     before: Submap, after: Submap, keyframe_ids: Iterable[int], n_landmarks: int | None = None
@@ -48,10 +51,6 @@ def _depth_ratios(before: Submap, after: Submap, k: int, n: int) -> FloatArray:
     depths = [submap.depths(ids, se3.inverse(submap.T_submap_kf[k])) for submap in (before, after)]
     in_front = (depths[0] > 0) & (depths[1] > 0)
     return np.asarray(depths[1][in_front] / depths[0][in_front], np.float64)
-
-
-N_NEAREST = 3
-"""Keyframes that a newer one follows: one alone may have been moved by its own noise."""
 
 
 def apply_late(

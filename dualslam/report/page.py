@@ -29,6 +29,7 @@ VERDICTS = {
     "doubtful": "Part of this trajectory is probably wrong.",
 }
 _EVENT_COLUMNS = {"frame": "num", "time": "num", "event": None, "submap": "num", "what belongs to it": "words"}
+_HEADS = ("frame", "submaps", "factors", "cost before", "cost after", "rejected", "bent by", "moved by")
 
 
 def report_page(run: RunData | str | Path) -> str:
@@ -239,9 +240,6 @@ def _events(run: RunData) -> Markup:
     if len(run.events) > MAX_EVENTS:
         words += f", of which the first {MAX_EVENTS} are here and all in {EVENTS}"
     return tag("details", tag("summary", words), cards(tuple(_EVENT_COLUMNS), rows, _EVENT_COLUMNS))
-
-
-_HEADS = ("frame", "submaps", "factors", "cost before", "cost after", "rejected", "bent by", "moved by")
 
 
 def atlas_section(run: RunData) -> Markup | None:

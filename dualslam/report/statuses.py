@@ -19,6 +19,7 @@ MEANING: dict[FrameStatus, str] = {
     FrameStatus.UNREADABLE: "the image could not be read",
 }
 WITHOUT_POSE = (FrameStatus.LOST, FrameStatus.INITIALISING, FrameStatus.DROPPED, FrameStatus.UNREADABLE)
+_WHERE = frozenset({"event", "frame", "timestamp_s", "submap"})
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,9 +59,6 @@ def seen_again(summary: Mapping[str, Any], relocalisations_more: int = 0) -> lis
 def span(first: int, last: int) -> str:
     """Return ``frame 3`` or ``frames 3 to 9``."""
     return f"frame {first}" if first == last else f"frames {first} to {last}"
-
-
-_WHERE = frozenset({"event", "frame", "timestamp_s", "submap"})
 
 
 def event_words(event: dict[str, Any]) -> str:

@@ -25,6 +25,7 @@ from dualslam.run.sources import ANY_FOV_DEG, open_source
 
 SEARCHED_FRAMES = 200
 """The first ones: some seconds, in which a camera in a hand or on a car has moved."""
+AUTO, ORB = "auto", "orb"
 
 
 def open_without_calibration(source: str, **selection: Any) -> RecordedSequence:
@@ -78,9 +79,6 @@ def with_prior(config: Config, found: FocalSearch) -> Config:
     """Return a config whose self-calibration trusts the focal length as far as it was found."""
     sigma = max(config.calibration.log_focal_sigma, found.log_sigma)
     return config.with_section("calibration", log_focal_sigma=sigma)
-
-
-AUTO, ORB = "auto", "orb"
 
 
 def with_frontend_chosen(

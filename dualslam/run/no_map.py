@@ -36,6 +36,21 @@ WORDS = {
     FailureReason.CHI_SQUARE: REFUSED,
     FailureReason.SOLVER: REFUSED,
 }
+MOSAIC = "the images look like a raw colour mosaic (Bayer), as a sensor gives it: convert them to colour or grey first"
+DARK = "the images are too dark: hardly anything in them is above the noise of the sensor"
+FLICKER = "the brightness jumps from frame to frame (flicker, or an exposure that alternates): fix the exposure"
+MOSAIC_RATIO = 1.15
+"""Mean difference of adjacent pixels over that of pixels two apart. Of a scene it is below 1, of noise 1."""
+DARK_GREY = 32
+"""Grey level that 99 of 100 pixels of a dark image do not reach: an eighth of the range."""
+FLICKER_STOPS = 1.0
+"""Between an image and the next; an automatic exposure takes several frames for as much."""
+MOST = 0.5
+"""Share of the images, or of their pairs, that must show it."""
+MIN_SIDE_PX = 32
+"""Of an image that is looked at for a mosaic."""
+STEP = 4
+"""Rows and columns of the pixels whose brightness is looked at."""
 
 
 class StartRefusals:
@@ -70,23 +85,6 @@ class StartRefusals:
             words = WORDS.get(reason, f"no start was possible ({reason})")
         total = self._counts.total()
         return words if n == total else f"{words} ({n} of {total} frames)"
-
-
-MOSAIC = "the images look like a raw colour mosaic (Bayer), as a sensor gives it: convert them to colour or grey first"
-DARK = "the images are too dark: hardly anything in them is above the noise of the sensor"
-FLICKER = "the brightness jumps from frame to frame (flicker, or an exposure that alternates): fix the exposure"
-MOSAIC_RATIO = 1.15
-"""Mean difference of adjacent pixels over that of pixels two apart. Of a scene it is below 1, of noise 1."""
-DARK_GREY = 32
-"""Grey level that 99 of 100 pixels of a dark image do not reach: an eighth of the range."""
-FLICKER_STOPS = 1.0
-"""Between an image and the next; an automatic exposure takes several frames for as much."""
-MOST = 0.5
-"""Share of the images, or of their pairs, that must show it."""
-MIN_SIDE_PX = 32
-"""Of an image that is looked at for a mosaic."""
-STEP = 4
-"""Rows and columns of the pixels whose brightness is looked at."""
 
 
 class ImageFaults:

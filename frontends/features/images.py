@@ -13,6 +13,16 @@ from dualslam.core.errors import FrontendError, InputError
 from dualslam.core.interfaces import Frontend
 from dualslam.core.types import Features, FloatArray
 
+_KINDS = {"uv_px": "f", "uv_rect_px": "f", "sigma_px": "f", "scale": "f", "octave": "iu", "angle_rad": "f"}
+"""Of the arrays' types, as numpy has them; `dualslam.frontends.conformance` asks for more."""
+CELL_PX = 16
+QUIET_SHARE = 0.1
+"""Of the cells this share holds little but noise: the rest of the image may be as rich as it likes."""
+ROUNDING_VARIANCE = 1.0 / 12.0
+"""Of a grey level that is a whole number."""
+_SECOND_DIFFERENCE = np.array([1.0, -2.0, 1.0])
+"""Along both axes: blind to planes and to edges along the axes (Immerkaer 1996, Fast noise variance estimation)."""
+
 
 def to_grey(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """The image as contiguous (H, W) uint8.
@@ -33,10 +43,6 @@ def to_rgb(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
     if image.ndim == 2:
         image = np.repeat(image[:, :, None], 3, axis=2)
     return np.ascontiguousarray(image)
-
-
-_KINDS = {"uv_px": "f", "uv_rect_px": "f", "sigma_px": "f", "scale": "f", "octave": "iu", "angle_rad": "f"}
-"""Of the arrays' types, as numpy has them; `dualslam.frontends.conformance` asks for more."""
 
 
 def features_of(frontend: Frontend, image: NDArray[np.uint8]) -> Features:
@@ -74,15 +80,6 @@ def _problem(found: object) -> str | None:
         if array.shape != (*found.uv_px.shape[:1], *per_feature):
             return f"Features whose {name} is {array.shape}, beside {found.uv_px.shape} of uv_px"
     return None
-
-
-CELL_PX = 16
-QUIET_SHARE = 0.1
-"""Of the cells this share holds little but noise: the rest of the image may be as rich as it likes."""
-ROUNDING_VARIANCE = 1.0 / 12.0
-"""Of a grey level that is a whole number."""
-_SECOND_DIFFERENCE = np.array([1.0, -2.0, 1.0])
-"""Along both axes: blind to planes and to edges along the axes (Immerkaer 1996, Fast noise variance estimation)."""
 
 
 def estimate_noise(image: NDArray[np.uint8]) -> float:

@@ -18,6 +18,8 @@ from dualslam.map.submap import Submap
 VIEW_COSINE_MIN = 0.5  # a patch seen from more than 60 degrees off its mean direction does not look the same
 SAFE = 2
 """With fewer proven landmarks than so many times the inliers that are asked for, or than the majority, all are used."""
+NEARER, NEAREST = 0.5, 0.05
+"""Too near is nearer than so many times the depth of the nearest proven points (this share of them)."""
 
 
 def covering_keyframes(submap: Submap, at_most: int, min_new: int) -> list[int]:
@@ -118,10 +120,6 @@ def trusted(submap: Submap, ids: IntArray, T_cam_submap: FloatArray, min_inliers
     if np.count_nonzero(proven) < max(SAFE * min_inliers, MAJORITY * len(ids)):
         return np.ones(len(ids), np.bool_)
     return ~nearer_than_proven(submap.depths(ids, T_cam_submap), proven)
-
-
-NEARER, NEAREST = 0.5, 0.05
-"""Too near is nearer than so many times the depth of the nearest proven points (this share of them)."""
 
 
 def nearer_than_proven(depth: FloatArray, proven: BoolArray) -> BoolArray:

@@ -16,6 +16,8 @@ from dualslam.io.export.exported_map import ExportedMap
 
 FOLDER = Path("sparse") / "0"
 CORNER_PX = 0.5
+DECIMALS = 15
+"""As many as a number of about 1 has: what is left of a 0 after some turns, such as 4.9e-19, is written as 0."""
 
 
 def image_name(frame: int) -> str:
@@ -78,10 +80,6 @@ def _points(exported: ExportedMap, place: np.ndarray) -> str:
         colour = " ".join(str(c) for c in exported.colour[p].tolist())
         lines.append(f"{p + 1} {decimals(exported.xyz[p])} {colour} {decimals(mean[p : p + 1])} {track}")
     return "\n".join(lines) + "\n"
-
-
-DECIMALS = 15
-"""As many as a number of about 1 has: what is left of a 0 after some turns, such as 4.9e-19, is written as 0."""
 
 
 def decimals(numbers: Iterable[float]) -> str:

@@ -20,6 +20,14 @@ from dualslam.io.export.exported_map import ExportedMap
 _VERTEX = np.dtype(
     [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("red", "u1"), ("green", "u1"), ("blue", "u1")], align=False
 )
+LOOKS_BACK = np.diag([1.0, -1.0, -1.0])
+POINTS = "points.ply"
+TO_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
+GSPLAT = (
+    "in a checkout of gsplat (github.com/nerfstudio-project/gsplat): "
+    "python examples/simple_trainer.py default --data_factor 1 --data_dir {out} --result_dir {out}_splat"
+)
+NERFSTUDIO = "with nerfstudio installed: ns-train splatfacto --data {out}"
 
 
 def write_ply(exported: ExportedMap, out: Path) -> None:
@@ -33,9 +41,6 @@ def write_ply(exported: ExportedMap, out: Path) -> None:
     head = ["ply", "format binary_little_endian 1.0", f"element vertex {len(vertices)}"]
     head += [f"property float {name}" for name in "xyz"] + [f"property uchar {name}" for name in colours]
     write_bytes(out, ("\n".join([*head, "end_header"]) + "\n").encode() + vertices.tobytes())
-
-
-LOOKS_BACK = np.diag([1.0, -1.0, -1.0])
 
 
 def write_bal(exported: ExportedMap, out: Path) -> None:
@@ -89,10 +94,6 @@ def _pose(T: FloatArray) -> str:
     return decimals((*T[:3, 3], *quat))
 
 
-POINTS = "points.ply"
-TO_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
-
-
 def write_nerfstudio(exported: ExportedMap, out: Path) -> None:
     """Write ``transforms.json`` and ``points.ply`` into a folder; images and masks are those that are there.
 
@@ -130,12 +131,6 @@ class ExportFormat:
     has_colours: bool = False  # whether its points have colours
     next_command: str = ""  # where and what to type next, with the path as ``{out}``; empty if there is none
 
-
-GSPLAT = (
-    "in a checkout of gsplat (github.com/nerfstudio-project/gsplat): "
-    "python examples/simple_trainer.py default --data_factor 1 --data_dir {out} --result_dir {out}_splat"
-)
-NERFSTUDIO = "with nerfstudio installed: ns-train splatfacto --data {out}"
 
 FORMATS = {
     "bal": ExportFormat(write_bal),

@@ -42,6 +42,7 @@ DICTIONARIES = {
     "aruco_6x6": cv2.aruco.DICT_6X6_250,
     "aruco_original": cv2.aruco.DICT_ARUCO_ORIGINAL,
 }
+SCALE = "scale.json"
 
 
 @dataclass(frozen=True, slots=True)
@@ -206,9 +207,6 @@ def _triangulate(exported: ExportedMap, seen: list[tuple[int, FloatArray]]) -> F
         A += across
         b += across @ T[:3, 3]
     return np.asarray(np.linalg.solve(A, b), np.float64)
-
-
-SCALE = "scale.json"
 
 
 def write_scale(run: Path, metres_per_unit: float, sigma_rel: float | None, words: str) -> None:
