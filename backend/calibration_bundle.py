@@ -19,7 +19,7 @@ from dualslam.core.errors import SolverError
 from dualslam.core.noise_model import MAX_TRIES, MIN_DEPTH_MU
 from dualslam.core.types import FloatArray
 
-MAX_ITERATIONS, TOLERANCE = 100, 1e-5
+MAX_ITERATIONS, TOLERANCE = 100, 1e-4
 """Most need a few. Where the focal length is far off, the way is long and bent: lens and focal length make up for each
 other."""
 
