@@ -16,6 +16,7 @@ from dualslam.core.geometry import se3
 from dualslam.core.noise_model import GROUP
 from dualslam.core.types import FrameStatus
 from dualslam.io.run_folder import FrameRow
+from dualslam.map.anchors import Anchor
 from dualslam.map.submap import Submap
 from dualslam.recovery.scale_parts import part_what_lost_its_scale
 from dualslam.run.results import trajectories_of
@@ -146,9 +147,9 @@ def lose_scale(system: System, submap: Submap, place: int) -> None:
     lost.landmarks["xyz_mu"][own] = centre + LOST_BY * (lost.landmarks["xyz_mu"][own] - centre)
     for k in before:
         lost.T_submap_kf[k] = larger(lost.T_submap_kf[k], centre)
-    for pose in system.poses.values():
+    for i, pose in system.poses.items():
         if pose.submap_id == submap.id and submap.keyframe_for(pose.keyframe_id) in before:
-            pose.T_kf_cam[:3, 3] *= LOST_BY
+            system.poses[i] = pose.at(Anchor(pose.keyframe_id, se3.scaled(pose.T_kf_cam, LOST_BY)))
     submap.take_over(lost)
 
 
