@@ -23,8 +23,9 @@ from dualslam.core.types import Failure, FailureReason, Features, FloatArray, Ke
 from dualslam.map.submap import Submap
 
 UPDATE_SIGMA_RATIO = 0.7
-"""An answer whose focal length has a sigma below this share of the last one's has twice the information: it changes the
-camera again, however little."""
+"""A camera may have been changed by an answer less sure than `max_focal_sigma`. It is changed again, however little, if
+the new sigma of the focal length is below this share of that answer's: twice the information. One that was sure stays,
+until another is significantly different."""
 AT_LOSS = 1.05
 """A map that may be at its end is asked once more, where it has so many times the keyframes of when it was asked: the
 next one begins with what it says. Lower, single frames without a pose would each cost a question."""
@@ -32,6 +33,8 @@ FEWEST_KEYFRAMES = 10
 """Of a map that is asked before it is old enough: since the run ends, or since a lost map waits to be joined to it."""
 FAR_SIGMAS = 2.0
 """Standard deviations of the focal length's prior: a correction beyond them is to be confirmed by later keyframes."""
+SURE_SIGMA = 0.01
+"""Of the log focal length: an answer that is no surer than this is not the last, however little was known before."""
 
 log = logging.getLogger(__name__)
 
@@ -208,9 +211,12 @@ class Calibration:
         return before
 
     def _is_much_surer(self, covariance: FloatArray) -> bool:
-        """Whether an answer is worth a change that is not significant."""
-        present, found = self.log_focal_sigma, float(np.sqrt(covariance[0, 0]))
-        return present is not None and found < UPDATE_SIGMA_RATIO * present
+        """Whether an answer is worth a change that is not significant: only where the present one was hardly sure."""
+        config, present, found = self._config, self.log_focal_sigma, float(np.sqrt(covariance[0, 0]))
+        if present is None:
+            return False
+        hardly_sure = present > min(config.max_focal_sigma, SURE_SIGMA)
+        return hardly_sure and found < UPDATE_SIGMA_RATIO * present
 
     def rectified(self, view: View) -> View:
         """Return a view with the pixels of the present camera; features without a place there keep their old one."""
