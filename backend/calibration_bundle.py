@@ -9,9 +9,9 @@ from functools import partial
 
 import numpy as np
 
-from dualslam.backend.final_refinement import FORGETS_AT, LEAST_NOISE
+from dualslam.backend.final_refinement import LEAST_NOISE
 from dualslam.backend.point_refinement import huber
-from dualslam.backend.schur import Lens, Loss, Optimum, State, System, geman_mcclure, optimise
+from dualslam.backend.schur import Lens, Optimum, State, System, optimise
 from dualslam.core.bundle import BundleProblem
 from dualslam.core.camera.corrected import LensCorrection
 from dualslam.core.chi_square import MEDIAN_CHI2
@@ -19,7 +19,7 @@ from dualslam.core.errors import SolverError
 from dualslam.core.noise_model import MAX_TRIES, MIN_DEPTH_MU
 from dualslam.core.types import FloatArray
 
-MAX_ITERATIONS, TOLERANCE = 100, 1e-4
+MAX_ITERATIONS, TOLERANCE = 100, 1e-5
 """Most need a few. Where the focal length is far off, the way is long and bent: lens and focal length make up for each
 other."""
 
@@ -28,16 +28,18 @@ other."""
 class CalibratedOptimum:
     """Where the cost is least."""
 
+    T_submap_kf: FloatArray
+    """(K, 4, 4): the problem's keyframes; the first stays where it was, and so does its distance from the one farthest
+    from it."""
     correction: FloatArray  # (5,): of the camera as it was given
     covariance: FloatArray  # (5, 5): of the correction, by the Hessian, prior and all
-    follows: FloatArray  # (K, 6, 5): with a change d of the correction poses T go to ``T exp(follows @ d)``
+    follows: FloatArray  # (K, 6, 5): with a change d of the correction the poses go to ``T_submap_kf exp(follows @ d)``
     noise_ratio: float  # of the typical residual to its sigma
-    # Sum of the Huber losses, and the prior's, where these are least.
+    # Sum of the Huber losses, and the prior's.
     cost_before: float
     cost_after: float
     poses_under: Callable[[FloatArray], FloatArray]
-    """From a correction (5,) to the poses (K, 4, 4) of the least Huber losses, were the camera to stay there. The first
-    stays where it was, and so does its distance from the one farthest from it."""
+    """From another correction (5,) to the poses (K, 4, 4) at which the cost is least, were the camera to stay there."""
 
 
 class CorrectedLens:
@@ -90,9 +92,6 @@ def optimise_with_camera(
 ) -> CalibratedOptimum:
     """Minimise over poses, points and correction, without the few points that end behind a camera.
 
-    Huber's loss leads near. Its threshold is in the pixels' sigmas, and residuals are a tenth to a half of these: false
-    matches bend the lens. So a loss follows that forgets them, in units of the residuals.
-
     - `problem`: in the rectified pixels of the camera as it was given; `fixed` is not looked at.
     - `start`, `prior` (5,): the correction to begin at, and the prior sigmas of its parts about zero.
     - `robust_k`: Huber threshold in sigmas.
@@ -100,35 +99,30 @@ def optimise_with_camera(
     Raises `SolverError` if there is no optimum, or nothing fixes the correction.
     """
     problem = replace(problem, fixed=np.arange(len(problem.T_submap_kf)) == 0)
-    lens, loss = CorrectedLens(problem.K, np.diag(prior**-2.0)), partial(huber, k=robust_k)
-    near, first = _in_front(problem, loss, lens, start)
-    forgets = partial(geman_mcclure, shape=FORGETS_AT * _noise_ratio(near, first.state))
-    kept, found = _in_front(_at(near, first.state), forgets, lens, first.state.lens)
+    lens = CorrectedLens(problem.K, np.diag(prior**-2.0))
+    kept, found = _in_front(problem, robust_k, lens, start)
     state = _in_unit_of(problem, found.state)
     return CalibratedOptimum(
+        state.T_submap_kf,
         state.lens,
-        *System(kept, forgets, lens).about_lens(state),
+        *System(kept, partial(huber, k=robust_k), lens).about_lens(state),
         _noise_ratio(kept, state),
-        first.cost_before,
-        first.cost_after,
-        partial(_poses_under, _at(kept, state), loss),
+        found.cost_before,
+        found.cost_after,
+        partial(_poses_under, replace(kept, T_submap_kf=state.T_submap_kf, xyz_mu=state.xyz_mu), robust_k),
     )
 
 
-def _poses_under(problem: BundleProblem, loss: Loss, correction: FloatArray) -> FloatArray:
+def _poses_under(problem: BundleProblem, robust_k: float, correction: FloatArray) -> FloatArray:
     """Return the poses (K, 4, 4) at which the cost is least, were the camera another one."""
     lens = _HeldLens(problem.K, correction)
-    _, found = _in_front(problem, loss, lens, np.zeros(0))
+    _, found = _in_front(problem, robust_k, lens, np.zeros(0))
     return _in_unit_of(problem, found.state).T_submap_kf
 
 
-def _at(problem: BundleProblem, state: State) -> BundleProblem:
-    return replace(problem, T_submap_kf=state.T_submap_kf, xyz_mu=state.xyz_mu)
-
-
-def _in_front(problem: BundleProblem, loss: Loss, lens: Lens, start: FloatArray) -> tuple[BundleProblem, Optimum]:
+def _in_front(problem: BundleProblem, robust_k: float, lens: Lens, start: FloatArray) -> tuple[BundleProblem, Optimum]:
     """Minimise, and again without the points that are behind a camera; return what is left, and its optimum."""
-    p = problem
+    p, loss = problem, partial(huber, k=robust_k)
     for _ in range(MAX_TRIES + 1):
         found = optimise(p, loss, MAX_ITERATIONS, TOLERANCE, lens, start)
         T, xyz = found.state.T_submap_kf, found.state.xyz_mu

@@ -227,11 +227,11 @@ def _path_change(answer: _Answer, present: LensCorrection) -> float:
     Both maps are solved from the same observations alone: other ties would count as an effect of the camera.
     """
     try:
-        now, then = (answer.best.poses_under(each)[:, :3, 3] for each in (present.vector, answer.correction))
+        now = answer.best.poses_under(present.vector)[:, :3, 3]
     except (SolverError, np.linalg.LinAlgError):
         return 0.0
     path = float(np.linalg.norm(np.diff(now, axis=0), axis=1).sum())
-    aligned = umeyama(then, now)
+    aligned = umeyama(answer.best.T_submap_kf[:, :3, 3], now)
     return 0.0 if isinstance(aligned, Failure) else aligned.rmse / path
 
 
