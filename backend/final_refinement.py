@@ -50,7 +50,7 @@ def refine_submap(submap: Submap, robust_k: float, frames: FrameRows | None = No
     if len(submap.keyframes) < 2:
         return FORGETS_AT
     shape = FORGETS_AT * _residual_sigma(submap)
-    _refine(submap, robust_k, ((shape, _best_seen(submap)), (shape, _seen(submap))), frames)
+    _refine(submap, robust_k, ((shape, _best_seen(submap)), (shape, None)), frames)
     return shape
 
 
@@ -64,11 +64,15 @@ def settle_ties(submap: Submap, robust_k: float) -> None:
 
 
 def _refine(
-    submap: Submap, robust_k: float, passes: Iterable[tuple[float, IntArray]], frames: FrameRows | None
+    submap: Submap, robust_k: float, passes: Iterable[tuple[float, IntArray | None]], frames: FrameRows | None
 ) -> None:
-    """Refine a submap in passes, each with a shape of the loss and the landmarks that take part; the others follow."""
+    """Refine a submap in passes, each with a shape of the loss and the landmarks that take part; the others follow.
+
+    Without landmarks, None, all take part.
+    """
     first, *others = submap.keyframes
-    refined, seen, centre = submap.copy(), _seen(submap), se3.translation(submap.T_submap_kf[first])
+    refined, seen = submap.copy(), submap.landmarks_of_keyframes([first, *others])
+    centre = se3.translation(submap.T_submap_kf[first])
     for width, landmarks in passes:
         bundle = bundle_adjust(refined, others, [first], width, ITERATIONS, True, frames, landmarks)
         refined.apply_estimate(*bundle.estimate)
@@ -80,10 +84,6 @@ def _refine(
     unit = _extent(submap.keyframe_poses(others), centre) / _extent(T, centre)
     T[:, :3, 3] = centre + unit * (se3.translation(T) - centre)
     submap.apply_estimate(np.array(others), T, seen, centre + unit * (refined.landmarks["xyz_mu"][seen] - centre))
-
-
-def _seen(submap: Submap) -> IntArray:
-    return submap.landmarks_of_keyframes(list(submap.keyframes))
 
 
 def _best_seen(submap: Submap) -> IntArray:

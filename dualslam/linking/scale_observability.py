@@ -21,7 +21,7 @@ from dualslam.core.arrays import sum_by
 from dualslam.core.geometry import se3
 from dualslam.core.geometry.alignment import COVARIANCE_INFLATION
 from dualslam.core.geometry.projection import project_points, projection_jacobians
-from dualslam.core.noise_model import GROUP
+from dualslam.core.noise_model import GROUP, TINY
 from dualslam.core.types import FloatArray, IntArray
 from dualslam.linking.join_test import PIXEL_CHI2
 from dualslam.map.submap import Submap
@@ -252,7 +252,7 @@ def _scale_at(problem: _Problem, ids: IntArray) -> tuple[FloatArray, FloatArray]
     p = se3.act_each(T, problem.xyz[point])
     by_pose = np.column_stack([p[:, 1], -p[:, 0], np.zeros((len(p), 3)), np.ones(len(p))]) / p[:, 2:]
     by_point = T[:, 2, :3] / p[:, 2:]
-    share = 1.0 / np.maximum(np.einsum("ri,rij,rj->r", by_point, problem.inverse[point], by_point), 1e-12)
+    share = 1.0 / np.maximum(np.einsum("ri,rij,rj->r", by_point, problem.inverse[point], by_point), TINY)
     share /= share.sum()
     g_pose = sum_by(kf, share[:, None] * by_pose, len(problem.ids))
     g_point = sum_by(point, share[:, None] * by_point, len(problem.xyz))

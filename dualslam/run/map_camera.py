@@ -21,6 +21,7 @@ from dualslam.core.config.settings import Config
 from dualslam.core.errors import InputError
 from dualslam.core.geometry.so3 import exp
 from dualslam.core.interfaces import Sequence
+from dualslam.core.noise_model import TINY
 from dualslam.core.types import FloatArray, Frame, Track
 from dualslam.io.map_store import load_atlas, load_camera
 from dualslam.io.reduced import resized_frames
@@ -199,7 +200,7 @@ def log_focal_of(seen: list[_Seen]) -> tuple[float, float] | None:
             information += H[6, 6] - H[6, :6] @ solved[:, 0]
             gradient += g[6] - H[6, :6] @ solved[:, 1]
             parts.append(solved)
-        step = gradient / max(information, 1e-12)
+        step = gradient / max(information, TINY)
         a += step
         for T, solved in zip(poses, parts, strict=True):
             d = solved[:, 1] - solved[:, 0] * step
@@ -207,4 +208,4 @@ def log_focal_of(seen: list[_Seen]) -> tuple[float, float] | None:
             T[:3, :3], T[:3, 3] = R @ T[:3, :3], R @ T[:3, 3] + d[:3]
         if abs(step) < 1e-6:
             break
-    return a, 1.0 / math.sqrt(max(information, 1e-12))
+    return a, 1.0 / math.sqrt(max(information, TINY))

@@ -15,7 +15,8 @@ from dualslam.atlas.record import FrameStamp
 from dualslam.atlas.trajectory import FramePose, Path
 from dualslam.core.errors import SolverError
 from dualslam.core.events import EventKind
-from dualslam.core.noise_model import MAX_TRIES, PROOF_VIEWS
+from dualslam.core.geometry import se3
+from dualslam.core.noise_model import MAX_TRIES, PROOF_VIEWS, TINY
 from dualslam.core.resources import MB
 from dualslam.core.types import FailureReason, FrameMethod, FrameStatus, View
 from dualslam.linking.correspondences import landmarks_shown_in
@@ -63,16 +64,17 @@ class Registering:
         with record.timer.measure("ties"):
             copies = self._showing_copies()
             for m, submap in record.atlas.submaps.items():
-                grown = submap.copy()
-                if m in copies or not (n := parts.new_registrar(grown).tie(partial(self._find_alike, grown))):
-                    continue
-                try:
-                    parts.settle_ties(grown)
-                except SolverError as error:
-                    log.warning("submap %d is not tied: %s", m, error)
+                if m in copies:
                     continue
                 before = submap.copy()
-                submap.take_over(grown)
+                if not (n := parts.new_registrar(submap).tie(partial(self._find_alike, submap))):
+                    continue
+                try:
+                    parts.settle_ties(submap)
+                except SolverError as error:
+                    log.warning("submap %d is not tied: %s", m, error)
+                    submap.take_over(before)
+                    continue
                 self._connections.carry(before, submap)
                 log.info("submap %d: %d pairs of features show one landmark", m, n)
 
@@ -243,12 +245,12 @@ class Registering:
             k, own = anchor.keyframe_id, [a for a in taken if taken[a] == m and a != anchor.keyframe_id]
             is_known = len(seen.landmark_ids) >= self._state.config.health.min_inliers
             if i != k and taken.get(k) == m and own and is_known:
-                T_kf_cam = anchor.T_kf_cam.copy()
-                T_kf_cam[:3, 3] *= _scale_between(submap, other, k, min(own, key=lambda a: (abs(a - i), a)))
+                scale = _scale_between(submap, other, k, min(own, key=lambda a: (abs(a - i), a)))
+                T_kf_cam = se3.scaled(anchor.T_kf_cam, scale)
                 yield replace(pose, submap_id=submap.id, keyframe_id=k, T_kf_cam=T_kf_cam), seen
 
 
 def _scale_between(submap: Submap, other: Submap, a: int, b: int) -> float:
     """Return by how much two keyframes are farther apart in one submap than in another."""
     here, there = (float(np.linalg.norm(s.T_submap_kf[a][:3, 3] - s.T_submap_kf[b][:3, 3])) for s in (submap, other))
-    return here / max(there, 1e-12)
+    return here / max(there, TINY)
