@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -115,8 +116,10 @@ def adjust_window(window: BundleProblem, robust_k: float, iterations: int = ITER
     """
     n_free, n_points = int(np.count_nonzero(~window.fixed)), len(window.xyz_mu)
     mine = np.flatnonzero(window.kf < n_free)
+    mine = mine[np.argsort(window.kf[mine], kind="stable")]
     pose, point = window.kf[mine], window.point[mine]
-    views = [np.flatnonzero(pose == f) for f in range(n_free)]
+    ends = np.cumsum(2 * np.bincount(pose, minlength=n_free)).tolist()
+    views = [slice(*bounds) for bounds in pairwise([0, *ends])]
     state = _evaluate(window, window.T_submap_kf, window.xyz_mu, robust_k)
     damping = FIRST_DAMPING
     for _ in range(iterations):
@@ -129,9 +132,9 @@ def adjust_window(window: BundleProblem, robust_k: float, iterations: int = ITER
         J_cam = J_point @ R[mine]
         J_pose = np.concatenate((J_cam @ so3.hat(safe[mine]), -J_cam), axis=2)
         J_pose_w = J_pose * state.weight[mine, None, None]
-        residuals = state.residuals[mine]
-        U = np.array([np.tensordot(J_pose_w[v], J_pose[v], ((0, 1), (0, 1))) for v in views])
-        g_pose = np.array([np.tensordot(J_pose_w[v], residuals[v], ((0, 1), (0, 1))) for v in views])
+        rows, rows_w, residuals = J_pose.reshape(-1, 6), J_pose_w.reshape(-1, 6), state.residuals[mine].ravel()
+        U = np.array([rows_w[v].T @ rows[v] for v in views])
+        g_pose = np.array([residuals[v] @ rows_w[v] for v in views])
         W = np.zeros((n_points, n_free, 6, 3))
         W[point, pose] = J_pose_w.transpose(0, 2, 1) @ J_point  # a keyframe sees a point once
         moved = _step(state, U, V, W.reshape(n_points, 6 * n_free, 3), g_pose, g_point, damping)

@@ -132,11 +132,12 @@ class Sampler:
         n, side = len(self._order), self._side
         at = np.empty((2, n, side, side), np.float32)
         np.add((uv_px[self._order] / self._shrunk).T[..., None, None] + self._right, self._down, out=at)
-        patches = np.empty((n, side, side), np.float32)
+        sampled, patches = np.empty((n * side, side), np.float32), np.empty((n, side, side), np.float32)
+        u, v = at.reshape(2, -1, side)
         for image, begin, end in self._runs:
-            u, v = at[:, begin:end].reshape(2, -1, side)
-            out = cv2.remap(image, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-            patches[self._order[begin:end]] = out.reshape(-1, side, side)
+            here = slice(begin * side, end * side)
+            cv2.remap(image, u[here], v[here], cv2.INTER_LINEAR, sampled[here], cv2.BORDER_REPLICATE)
+        patches[self._order] = sampled.reshape(n, side, side)
         return patches
 
 

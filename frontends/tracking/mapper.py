@@ -34,8 +34,6 @@ FEW = 0.5
 FAR_SIGMAS = 2.0
 """Parallax of a far point, in standard deviations of its two pixels: its depth is known to half."""
 
-N_GRIDS = 24  # keyframes whose grid of features is kept
-
 
 def spread_choice(uv_px: FloatArray, priority: IntArray, n: int, size_px: tuple[int, int]) -> BoolArray:
     """Choose up to `n` features, evenly from all cells of the image, the highest priority in each cell first.
@@ -67,7 +65,6 @@ class Mapper:
         self._camera = camera
         self._young: list[tuple[int, IntArray]] = []  # keyframe count at birth, landmark ids
         self._n_inserted = 0
-        self._grids: dict[int, tuple[Features, FeatureGrid]] = {}  # of the keyframes searched last
         self._gate_chi2 = CHI2_95[2]  # as it is for the keyframe that grows
 
     def observe(self, track: Track) -> None:
@@ -155,7 +152,7 @@ class Mapper:
         )
         matches = match_projected(
             frontend,
-            self._grid(k, features),
+            FeatureGrid.build(features.uv_rect_px),
             features,
             prediction.uv_px,
             SAME_POINT_PX * frontend.scale_factor**prediction.octave,
@@ -176,16 +173,6 @@ class Mapper:
             n_seen = submap.n_observations(np.stack([ids, there]))
             swap = n_seen[0] > n_seen[1]
             submap.merge_landmarks(np.where(swap, ids, there), np.where(swap, there, ids))
-
-    def _grid(self, k: int, features: Features) -> FeatureGrid:
-        """Return the grid of a keyframe's features: neighbours are searched again and again."""
-        known = self._grids.pop(k, None)
-        if known is None or known[0] is not features:
-            known = (features, FeatureGrid.build(features.uv_rect_px))
-        self._grids[k] = known
-        while len(self._grids) > N_GRIDS:
-            del self._grids[next(iter(self._grids))]
-        return known[1]
 
     def _triangulate(self, k: int, neighbours: list[int], candidates: BoolArray) -> IntArray:
         """Triangulate the keyframe's free features against several older keyframes.

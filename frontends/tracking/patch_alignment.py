@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -68,20 +69,31 @@ class _Aligned:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Patches:
-    """Of a keyframe's features, as far as they were asked for."""
+class _Templates:
+    """N patches about older observations, in their octaves."""
 
-    greys: NDArray[np.float32]  # (N, 2 HALF + 3, 2 HALF + 3)
-    is_known: BoolArray  # (N,)
+    greys: NDArray[np.float32]  # (N, S, S), S = 2 HALF + 1
+    to_parameters: NDArray[np.float32]  # (N, 3, S^2): takes greys to a shift and a contrast
+    is_sound: BoolArray  # (N,): of enough contrast, in both directions
 
     @classmethod
-    def of_size(cls, n: int) -> _Patches:
-        """Return none yet."""
-        return cls(np.zeros((n, 2 * HALF + 3, 2 * HALF + 3), np.float32), np.zeros(n, np.bool_))
+    def of(cls, patches: NDArray[np.float32]) -> _Templates:
+        """Make them of patches (N, S + 2, S + 2), whose rim serves their gradients.
 
-    def forget(self, feature: IntArray) -> None:
-        """Forget those of features that have moved."""
-        self.is_known[feature[feature < len(self.is_known)]] = False
+        Gauss-Newton with the templates' gradients (Baker and Matthews, IJCV 2004).
+        """
+        p = np.ascontiguousarray(patches.transpose(1, 2, 0))
+        by_u, by_v, grey = 0.5 * (p[1:-1, 2:] - p[1:-1, :-2]), 0.5 * (p[2:, 1:-1] - p[:-2, 1:-1]), p[1:-1, 1:-1]
+        J = np.stack([by_u, by_v, grey], axis=2).reshape(-1, 3, len(patches))
+        J -= J.mean(axis=0)  # which leaves the mean free
+        J = np.ascontiguousarray(J.transpose(2, 0, 1))
+        H = np.matmul(J.swapaxes(1, 2), J).astype(np.float64)
+        low, high = np.linalg.eigvalsh(H[:, :2, :2]).T
+        is_sound = (high < MAX_CONDITION * low) & (H[:, 2, 2] > MIN_CONTRAST**2 * J.shape[1])
+        H[~is_sound] = np.eye(3)
+        to_parameters = np.matmul(J.astype(np.float64), np.linalg.inv(H).swapaxes(1, 2)).swapaxes(1, 2)
+        to_parameters = np.ascontiguousarray(to_parameters, np.float32)
+        return cls(patches[:, 1:-1, 1:-1], to_parameters, is_sound)
 
 
 class PatchAlignment:
@@ -90,12 +102,13 @@ class PatchAlignment:
     def __init__(self, images: KeyframeImages, camera: Callable[[], Camera]) -> None:
         self._images, self._camera = images, camera
         self._pyramids: dict[int, Pyramid] = {}
-        self._patches: dict[int, _Patches] = {}
+        self._templates: dict[tuple[int, int], tuple[Any, ...]] = {}  # by keyframe and feature, each made once
 
     def refine(self, submap: Submap, rows: IntArray) -> None:
         """Move the pixels of observations to where their patches match, and remove those that match nowhere near."""
-        self._pyramids = {k: levels for k, levels in self._pyramids.items() if k in self._images}
-        self._patches = {k: patches for k, patches in self._patches.items() if k in self._images}
+        gone = {k for k in self._pyramids if k not in self._images}
+        self._pyramids = {k: levels for k, levels in self._pyramids.items() if k not in gone}
+        self._templates = {key: made for key, made in self._templates.items() if key[0] not in gone}
         pairs = self._pairs(submap, rows)
         tested, agrees = np.zeros(len(pairs.row), np.bool_), np.zeros(len(pairs.row), np.bool_)
         for of in _in_turn(pairs):
@@ -124,8 +137,8 @@ class PatchAlignment:
             uv[at] += shift_px[of]
             uv_rect[at] += uv_rect_px[n + of] - uv_rect_px[of]
             submap.keyframes[k] = replace(keyframe, features=replace(features, uv_px=uv, uv_rect_px=uv_rect))
-            if k in self._patches:
-                self._patches[k].forget(at)
+            for feature in at.tolist():
+                self._templates.pop((k, feature), None)
 
     def _pairs(self, submap: Submap, rows: IntArray) -> _Pairs:
         """Return the observations that have a reference, each with it.
@@ -173,29 +186,28 @@ class PatchAlignment:
         usable = inside(uv_there, steps, HALF + 1, camera.size_px) & np.isfinite(axes).all(axis=(1, 2))
         usable[usable] = inside(uv[usable], axes[usable], HALF, camera.size_px)
         images = [self._levels(k) for k in keyframes.tolist()]
-        templates = self._templates(pairs, uv_there, steps)
+        templates = self._templates_about(pairs, uv_there, steps)
         return _align(templates, images, image_of, uv, axes, usable, REFINED_PX * own_scale)
 
-    def _templates(self, pairs: _Pairs, uv_px: FloatArray, steps: FloatArray) -> NDArray[np.float32]:
-        """Return patches about the older observations, in their octaves; each is sampled once."""
-        feature, keyframes = pairs.feature_there, np.unique(pairs.kf_there).tolist()
-        templates = np.empty((len(feature), 2 * HALF + 3, 2 * HALF + 3), np.float32)
-        rows = {k: np.flatnonzero(pairs.kf_there == k) for k in keyframes}
-        is_new = np.zeros(len(feature), np.bool_)
-        for k, of in rows.items():
-            kept = self._patches.get(k)
-            if kept is None or len(kept.is_known) <= feature[of].max():
-                kept = self._patches[k] = _Patches.of_size(int(feature[of].max()) + 1000)
-            is_new[of] = ~kept.is_known[feature[of]]
-        if is_new.any():  # one call for all
-            new, image_of = np.unique(pairs.kf_there[is_new], return_inverse=True)
+    def _templates_about(self, pairs: _Pairs, uv_px: FloatArray, steps: FloatArray) -> _Templates:
+        """Return the templates about the older observations."""
+        keys = list(zip(pairs.kf_there.tolist(), pairs.feature_there.tolist(), strict=True))
+        row_of_new = {key: row for row, key in enumerate(keys) if key not in self._templates}
+        if row_of_new:  # one call for all
+            row = np.array(list(row_of_new.values()))
+            new, image_of = np.unique(pairs.kf_there[row], return_inverse=True)
             images = [self._levels(k) for k in new.tolist()]
-            templates[is_new] = Sampler(images, image_of, steps[is_new], HALF + 1)(uv_px[is_new])
-        for k, of in rows.items():
-            kept, new_of = self._patches[k], of[is_new[of]]
-            kept.greys[feature[new_of]], kept.is_known[feature[new_of]] = templates[new_of], True
-            templates[of] = kept.greys[feature[of]]
-        return templates
+            made = _Templates.of(Sampler(images, image_of, steps[row], HALF + 1)(uv_px[row]))
+            self._templates.update(
+                zip(row_of_new, zip(made.greys, made.to_parameters, made.is_sound, strict=True), strict=True)
+            )
+        side = 2 * HALF + 1
+        greys, to_parameters, is_sound = zip(*(self._templates[key] for key in keys), strict=True)
+        return _Templates(
+            np.concatenate(greys).reshape(-1, side, side),
+            np.concatenate(to_parameters).reshape(-1, 3, side**2),
+            np.array(is_sound),
+        )
 
     def _as_read(self, submap: Submap, k: int, feature: IntArray, camera: Camera) -> FloatArray:
         """Return where a keyframe's image shows features."""
@@ -232,7 +244,7 @@ def _joined(left: IntArray, right: IntArray) -> tuple[IntArray, IntArray]:
 
 
 def _align(
-    templates: NDArray[np.float32],
+    templates: _Templates,
     images: list[Pyramid],
     image_of: IntArray,
     uv_px: FloatArray,
@@ -240,33 +252,20 @@ def _align(
     usable: BoolArray,
     max_shift_px: FloatArray,
 ) -> _Aligned:
-    """Shift patches of an image until they look like templates (N, 2 HALF + 3, 2 HALF + 3), up to contrast and mean.
-
-    Gauss-Newton with the templates' gradients (Baker and Matthews, IJCV 2004).
-    """
-    n = len(uv_px)
-    inner = templates[:, 1:-1, 1:-1].reshape(n, -1)
-    by_u = 0.5 * (templates[:, 1:-1, 2:] - templates[:, 1:-1, :-2]).reshape(n, -1)
-    by_v = 0.5 * (templates[:, 2:, 1:-1] - templates[:, :-2, 1:-1]).reshape(n, -1)
-    J = np.stack([by_u, by_v, inner], axis=2)
-    J -= J.mean(axis=1, keepdims=True)  # which leaves the mean free
-    H = np.matmul(J.swapaxes(1, 2), J).astype(np.float64)
-    low, high = np.linalg.eigvalsh(H[:, :2, :2]).T
-    tested = usable & (high < MAX_CONDITION * low) & (H[:, 2, 2] > MIN_CONTRAST**2 * inner.shape[1])
-    row, shift, step = np.flatnonzero(tested), np.zeros((n, 2)), np.full(n, np.inf)
-    agrees = np.zeros(n, np.bool_)
+    """Shift patches of an image until they look like templates, up to contrast and mean."""
+    n, tested = len(uv_px), usable & templates.is_sound
+    row, shift, agrees = np.flatnonzero(tested), np.zeros((n, 2)), np.zeros(n, np.bool_)
     if len(row):
-        to_parameters = np.matmul(np.linalg.inv(H[row]), J[row].swapaxes(1, 2)).astype(np.float32)
-        axes = axes[row]
+        to_parameters, axes, begin, moved = templates.to_parameters[row], axes[row], uv_px[row], shift[row]
         sampler = Sampler(images, image_of[row], axes, HALF)
         for _ in range(N_ITERATIONS):
-            found = sampler(uv_px[row] + shift[row]).reshape(len(row), -1, 1)
+            found = sampler(begin + moved).reshape(len(row), -1, 1)
             du, dv, contrast = np.matmul(to_parameters, found)[:, :, 0].astype(np.float64).T
             d = np.stack([du, dv], axis=1) / np.maximum(contrast, 0.3)[:, None]
-            step[row] = np.linalg.norm(d, axis=1)
-            d /= np.maximum(step[row], 1.0)[:, None]
-            shift[row] -= np.einsum("nij,nj->ni", axes, d)
-        found = sampler(uv_px[row] + shift[row])
-        agrees[row] = correlate(inner[row].reshape(found.shape), found) > AGREES
-    agrees &= (step < CONVERGED) & (np.linalg.norm(shift, axis=1) < max_shift_px)
+            step = np.linalg.norm(d, axis=1)
+            d /= np.maximum(step, 1.0)[:, None]
+            moved -= np.einsum("nij,nj->ni", axes, d)
+        similar = correlate(templates.greys[row], sampler(begin + moved)) > AGREES
+        agrees[row] = similar & (step < CONVERGED) & (np.linalg.norm(moved, axis=1) < max_shift_px[row])
+        shift[row] = moved
     return _Aligned(shift, tested, agrees)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -76,17 +77,6 @@ def correct_shutter(
     return replace(features, uv_px=features.uv_px + uv_rect_px - features.uv_rect_px, uv_rect_px=uv_rect_px)
 
 
-def _turned(rays: FloatArray, share: FloatArray, turn_rad: FloatArray) -> FloatArray:
-    """Turn each ray (N, 3) by its share (N,) of a turn (3,), by Rodrigues' formula: N matrices take thrice as long."""
-    angle_rad = float(np.linalg.norm(turn_rad))
-    axis = turn_rad / max(angle_rad, TINY)
-    across = rays @ so3.hat(axis).T
-    by = share * angle_rad
-    # 1 - cos as a square: small turns keep their digits.
-    inwards = across @ so3.hat(axis).T
-    return np.asarray(rays + np.sin(by)[:, None] * across + (2 * np.sin(0.5 * by) ** 2)[:, None] * inwards, np.float64)
-
-
 def at_mid_row(
     uv_rect_px: FloatArray, read_v_px: FloatArray, camera: Camera, *turns_rad: FloatArray
 ) -> list[FloatArray]:
@@ -94,12 +84,26 @@ def at_mid_row(
 
     For each of several turns (3,) of the camera while an image is read, in its own axes.
     """
+    return [_to_mid_row(uv_rect_px, camera, turn_rad)(read_v_px) for turn_rad in turns_rad]
+
+
+def _to_mid_row(uv_rect_px: FloatArray, camera: Camera, turn_rad: FloatArray) -> Callable[[FloatArray], FloatArray]:
+    """Return what `at_mid_row` does with rows (N,), by Rodrigues' formula: N matrices take thrice as long."""
     K = camera.K
     f, c = np.diag(K)[:2], K[:2, 2]
     rays = np.column_stack([(uv_rect_px - c) / f, np.ones(len(uv_rect_px))])
-    share = read_v_px / camera.height - 0.5
-    turned = (_turned(rays, share, turn_rad) for turn_rad in turns_rad)
-    return [np.asarray(f * each[:, :2] / each[:, 2:] + c, np.float64) for each in turned]
+    angle_rad = float(np.linalg.norm(turn_rad))
+    hat = so3.hat(turn_rad / max(angle_rad, TINY)).T
+    across = rays @ hat
+    inwards = across @ hat
+
+    def moved(read_v_px: FloatArray) -> FloatArray:
+        by = (read_v_px / camera.height - 0.5) * angle_rad
+        # 1 - cos as a square: small turns keep their digits.
+        turned = rays + np.sin(by)[:, None] * across + (2 * np.sin(0.5 * by) ** 2)[:, None] * inwards
+        return np.asarray(f * turned[:, :2] / turned[:, 2:] + c, np.float64)
+
+    return moved
 
 
 def straighten(uv_px: FloatArray, camera: Camera, turn_rad: FloatArray) -> FloatArray:
@@ -111,9 +115,8 @@ def straighten(uv_px: FloatArray, camera: Camera, turn_rad: FloatArray) -> Float
 
 def find_as_read(uv_px: FloatArray, uv_rect_px: FloatArray, camera: Camera, turn_rad: FloatArray) -> FloatArray:
     """Return where an image shows what features have at pixels (N, 2), and rectified: inverse of `straighten`."""
-    read_px = uv_px
+    read_px, moved = uv_px, _to_mid_row(uv_rect_px, camera, -turn_rad)
     # Each was read in a row that is known once it is put back: a second time, it is.
     for _ in range(2):
-        (moved_px,) = at_mid_row(uv_rect_px, read_px[:, 1], camera, -turn_rad)
-        read_px = uv_px + moved_px - uv_rect_px
+        read_px = uv_px + moved(read_px[:, 1]) - uv_rect_px
     return read_px
