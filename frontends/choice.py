@@ -91,6 +91,8 @@ def _wide_steps(images: list[NDArray[np.uint8]], frontend: Frontend) -> str | No
     for before, after in pairwise(map(frontend.extract, images)):
         i, j = frontend.match_wide(before, after).index.T
         shares.append(len(i) / max(len(before), 1))
+        if 2 * np.count_nonzero(np.array(shares) >= SELDOM) >= len(images):
+            return None  # more than half of the steps, whatever follows
         moved = after.uv_px[j] - before.uv_px[i]
         flows.append(np.median(moved, axis=0) if len(i) >= MIN_CONSENSUS else np.full(2, np.nan))
     errors = np.linalg.norm(np.diff(np.reshape(flows, (-1, 2)), axis=0), axis=1) / images[0].shape[1]
