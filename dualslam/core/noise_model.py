@@ -50,6 +50,8 @@ DAMPING = 1e-4
 """Of normal equations, relative to the diagonal: keeps where it is what nothing fixes."""
 MAX_TRIES = 3
 """Times that what fails by chance is tried in vain before it counts as broken."""
+STRETCH_S = 2.0
+"""Seconds of a path by whose size and shape it is judged."""
 UNSURE_SCALE = 0.1
 """Standard deviation of the logarithm of the size of two seconds of the path: with more it is off by 20 % with a
 probability above 5 %. What is off by so much is too large or too small to be measured in."""

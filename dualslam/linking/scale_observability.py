@@ -69,7 +69,8 @@ def relative_scales(
     """Return the standard deviations (S + P, S + P) of the log of the ratio of scales between any two parts of a map.
 
     By all that it has seen, as `scale_sigmas_in_all`. The scale of a stretch is the size of its path: the RMS distance
-    of its keyframes from their centre. That of a place, where a link stands, is the one at which it sees its points.
+    of its keyframes from their centre, each counted by how well its position is known where the others are. That of a
+    place, where a link stands, is the one at which it sees its points.
     Infinite where nothing ties two parts to each other.
 
     - `stretches`, `places`: keyframe ids of each; two at least in a stretch.
@@ -82,7 +83,8 @@ def relative_scales(
     free, root = _directions(problem.reduced)
     seen = [_scale_at(problem, place) for place in places]
     by_points = [np.full(len(root), np.nan) if each is None else _by_poses(problem, *each) for each in seen]
-    g = np.array([*(_size_at(problem, part) for part in stretches), *by_points])
+    weight = _firmness(problem)
+    g = np.array([*(_size_at(problem, part, weight) for part in stretches), *by_points])
     between = np.asarray(SCALE_INFLATION * np.sqrt(COVARIANCE_INFLATION) * cdist(g @ root, g @ root), np.float64)
     between[~(cdist(g @ free, g @ free, "sqeuclidean") <= SLACK)] = np.inf
     np.fill_diagonal(between, 0.0)
@@ -265,13 +267,21 @@ def _by_poses(problem: _Problem, g_pose: FloatArray, g_point: FloatArray) -> Flo
     return np.asarray(g_pose - problem.H_cross @ follows.reshape(-1), np.float64)
 
 
-def _size_at(problem: _Problem, ids: IntArray) -> FloatArray:
+def _firmness(problem: _Problem) -> FloatArray:
+    """Return the inverse variance (F,) of each keyframe's position where the others are."""
+    n = len(problem.ids)
+    H = problem.reduced.reshape(n, 6, n, 6)[np.arange(n), :, np.arange(n)]
+    H = H + (SLACK * np.trace(H, axis1=1, axis2=2) + TINY)[:, None, None] * np.eye(6)
+    return np.asarray(1.0 / np.trace(np.linalg.inv(H)[:, 3:, 3:], axis1=1, axis2=2), np.float64)
+
+
+def _size_at(problem: _Problem, ids: IntArray, weight: FloatArray) -> FloatArray:
     """Return the derivative (6 F,) of the log of the path's size at some keyframes by the poses."""
     rows = np.searchsorted(problem.ids, ids)
-    T = problem.T_cam_submap[rows]
+    T, share = problem.T_cam_submap[rows], weight[rows, None] / weight[rows].sum()
     offset = se3.translation(se3.inverse(T))
-    offset = offset - offset.mean(axis=0)
-    squares = max(float((offset**2).sum()), np.finfo(float).tiny)
+    offset = offset - (share * offset).sum(axis=0)
+    squares = max(float((share * offset**2).sum()), np.finfo(float).tiny)
     by_pose = np.zeros((len(problem.ids), 6))
-    by_pose[rows, 3:] = -np.einsum("nij,nj->ni", se3.rotation(T), offset) / squares
+    by_pose[rows, 3:] = -np.einsum("nij,nj->ni", se3.rotation(T), share * offset) / squares
     return by_pose.reshape(-1)

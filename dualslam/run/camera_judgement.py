@@ -15,7 +15,7 @@ MAX_FOCAL_SIGMA = 0.03
 """Standard deviation of the logarithm of the focal length."""
 MAX_PATH_CHANGE = 0.02
 """RMS distance between two paths of the same keyframes, over their length. A run whose error is as large is not right
-(docs/bench.md). Half as much by a wrong camera leaves little room for other errors."""
+(docs/bench.md). Errors of other causes add to it in squares: a wrong camera may have half of the square."""
 MIN_FOCAL_CHANGE, MAX_FOCAL_SIGMAS = 0.1, 4.0
 """Of the logarithm of the focal length against the one that the map was made with until then: two sigmas of what a
 data sheet is off, and known to be more. Its own sigma is that of one submap: of 44 answers on 7-Scenes 1 % are 3.7
@@ -76,7 +76,7 @@ def _by_answers(answers: list[Event]) -> tuple[Level, str] | None:
         if not is_far:
             return None
         return Level.USABLE, f"The images show {shown}. The rest of the map is too short to confirm it. {check}"
-    if path_change < MAX_PATH_CHANGE / 2.0:
+    if path_change**2 < MAX_PATH_CHANGE**2 / 2.0:
         return None
     is_wrong = path_change > MAX_PATH_CHANGE or data["prior_sigmas"] > MAX_PRIOR_SIGMAS
     level = Level.DOUBTFUL if is_wrong else Level.USABLE

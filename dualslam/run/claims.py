@@ -13,7 +13,7 @@ import numpy as np
 
 from dualslam.atlas.atlas import Atlas, Link
 from dualslam.core.geometry import se3
-from dualslam.core.noise_model import GATE_SIGMAS, GROUP, MIN_DEPTH_MU, UNSURE_SCALE
+from dualslam.core.noise_model import GATE_SIGMAS, GROUP, MIN_DEPTH_MU, STRETCH_S, UNSURE_SCALE
 from dualslam.core.types import FloatArray, IntArray
 from dualslam.linking.scale_observability import relative_scales
 from dualslam.map.landmark_views import landmark_covariances, noise_excess, resection_covariance
@@ -21,8 +21,6 @@ from dualslam.map.submap import Submap
 
 POSITION_INFLATION = 1.1
 """As `SCALE_INFLATION` (`linking/scale_observability.py`), for positions."""
-STRETCH_S = 2.0
-"""Seconds of a path whose size is asked for, about a keyframe. It has `GROUP` keyframes at least."""
 NEAR = 2
 """Keyframes before and after by whose residuals, too, a position is judged: it is one against what they hold. The first
 after a blurred stretch see sharply what the blurred ones have placed."""
@@ -139,7 +137,7 @@ def _position_sigma(submap: Submap, keyframe_id: int, covariances: FloatArray) -
 
 
 def stretches_of(submap: Submap) -> dict[int, IntArray]:
-    """Return the keyframes of the stretch about each keyframe, by whose size its scale is judged."""
+    """Return the keyframes of the stretch about each keyframe, by whose size its scale is judged: `GROUP` at least."""
     ids = np.array(sorted(submap.keyframes), np.int64)
     times_s = np.array([submap.keyframes[k].timestamp_s for k in ids.tolist()])
     near = np.abs(np.subtract.outer(times_s, times_s)) <= STRETCH_S / 2.0

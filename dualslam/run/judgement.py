@@ -11,20 +11,21 @@ from dualslam.core.geometry import sim3
 from dualslam.core.geometry.umeyama import umeyama
 from dualslam.core.noise_model import UNSURE_SCALE
 from dualslam.core.trajectory import Trajectory
-from dualslam.core.types import Failure, FrameStatus
+from dualslam.core.types import Failure, FloatArray, FrameStatus, IntArray
 from dualslam.map.frame_records import FrameRow
 from dualslam.run.camera_judgement import MAX_PATH_CHANGE, judge_camera
 from dualslam.run.claims import Claims, claims_in_atlas
 from dualslam.run.measuring import MANY_REJECTED, Measured
 from dualslam.run.results import Trajectories
 from dualslam.system.audit.photometric import Disagreement, Sample, find_disagreement
-from dualslam.system.audit.verdict import Level, Reason, ReasonCode, Steps, Verdict, measure_steps
+from dualslam.system.audit.verdict import Level, Reason, ReasonCode, Verdict, measure_jumps
 from dualslam.system.system import System
 
-MAX_STEP_RATIO = 12.0
-"""A step of so many times the median of those about it is a jump. Right runs have at most 7, false joins 34 to 199."""
-MIN_JUMP_DEPTHS = 0.02
-"""Length of a jump over the median depth of the scene: shorter ones are noise of single frames."""
+MAX_JUMP = 0.2
+"""Share of the way of a stretch (`STRETCH_S`). A jump of so much leaves a quarter of itself, RMS, when the stretch is
+laid on the truth: then its shape is 5 % of the way off, and broken (docs/bench.md)."""
+MIN_MOTION_DEPTHS = 0.02
+"""Length over the median depth of the scene: shorter ones are noise of single frames."""
 MIN_COVERAGE = 0.95
 """Share of the frames that can be posed."""
 MAX_UNSURE = 0.1
@@ -61,14 +62,15 @@ def judge_run(
         text = "The run crashed: what it had found until then was kept. Report the error, and run again."
         reasons.append(_about_all(rows, ReasonCode.CRASHED, Level.USABLE, text))
     if len(trajectories.main):
-        steps, found = _steps(system, trajectories), find_disagreement(_held_samples(system, trajectories))
-        reasons += [*_jumps(system, trajectories, *steps), *_photometric(system, found), *_scale(rows)]
-        reasons += [*_loose_joins(system, trajectories), *_still(system, trajectories)]
+        index, jumps = _measure_jumps(system, trajectories.main)
+        found = find_disagreement(_held_samples(system, trajectories))
+        reasons += [*_jumps(index, jumps), *_photometric(system, found), *_still(system, trajectories)]
+        reasons += _scale(rows, _loosely_joined(system, trajectories))
         reasons += _replaced(system, trajectories, claims)
         camera, scores = judge_camera(system)
         reasons += [] if camera is None else [_about_all(rows, *camera)]
         scores |= {
-            str(ReasonCode.JUMP): float(steps[1].ratio.max(initial=0.0)),
+            str(ReasonCode.JUMP): float(jumps.max(initial=0.0)),
             str(ReasonCode.PHOTOMETRIC): found.worst,
         }
     if measured is not None:
@@ -142,25 +144,23 @@ def _longest_run(rows: Sequence[FrameRow], indices: list[int]) -> tuple[int, int
 # --- what is wrong
 
 
-def _steps(system: System, trajectories: Trajectories) -> tuple[Trajectory, Steps]:
-    """Return the main trajectory without frames that repeat the image before them, and its steps."""
-    main = trajectories.main.in_time_order()
+def _measure_jumps(system: System, main: Trajectory) -> tuple[IntArray, FloatArray]:
+    """Return the frames of the main trajectory but those that repeat the image before them, and the jumps between."""
     repeated = {system.numbers.index_of(i) for i in system.audit.repeated}
+    main = main.in_time_order()
     main = main.take(np.array([i not in repeated for i in main.index.tolist()], bool))
-    return main, measure_steps(main.timestamps_s, main.T_world_cam[:, :3, 3])
+    return main.index, measure_jumps(main.timestamps_s, main.T_world_cam[:, :3, 3])
 
 
-def _jumps(system: System, trajectories: Trajectories, main: Trajectory, steps: Steps) -> list[Reason]:
-    suspected = np.flatnonzero(steps.ratio > MAX_STEP_RATIO).tolist()
-    depth = {n: _median_depth(system, trajectories, int(main.index[n])) for n in suspected}
-    found = [n for n in suspected if steps.excess[n] > MIN_JUMP_DEPTHS * depth[n]]
-    if not found:
+def _jumps(index: IntArray, jumps: FloatArray) -> list[Reason]:
+    if jumps.max(initial=0.0) <= MAX_JUMP:
         return []
-    worst = max(found, key=lambda n: float(steps.ratio[n]))
-    first, last = sorted(main.index[worst : worst + 2].tolist())
+    worst = int(np.argmax(jumps))
+    first, last = sorted(index[worst : worst + 2].tolist())
     text = (
-        f"Between frames {first} and {last} the camera jumps: {steps.ratio[worst]:.0f} times its speed about there. "
-        "Two places that look alike may have been joined. Do not trust where both sides lie to each other."
+        f"Between frames {first} and {last} the camera jumps by {100 * jumps[worst]:.0f} % of what it goes in 2 s. "
+        "Two places that look alike may have been joined, or poses there hang on false matches. "
+        "Do not trust where both sides lie to each other."
     )
     return [Reason(ReasonCode.JUMP, Level.DOUBTFUL, text, first, last)]
 
@@ -194,16 +194,16 @@ def _photometric(system: System, found: Disagreement) -> list[Reason]:
     return [Reason(ReasonCode.PHOTOMETRIC, Level.DOUBTFUL, text, first, last)]
 
 
-def _scale(rows: Sequence[FrameRow]) -> list[Reason]:
-    """Return where the scale is unsure, if that is at many frames."""
-    known = {row.index: row.sigma_scale for row in rows if row.in_main_map and row.sigma_scale is not None}
-    unsure = sorted(index for index, sigma in known.items() if sigma > UNSURE_SCALE)
-    if len(unsure) <= MAX_UNSURE * len(known):
+def _scale(rows: Sequence[FrameRow], loose: set[int]) -> list[Reason]:
+    """Return where the scale is unsure, if that is at many frames; `loose`: where a link leaves it so."""
+    sigma = {row.index: row.sigma_scale or 0.0 for row in rows if row.in_main_map}
+    unsure = [i for i in sorted(sigma) if i in loose or sigma[i] > UNSURE_SCALE]
+    if len(unsure) <= MAX_UNSURE * len(sigma):
         return []
     first, last = _longest_run(rows, unsure)
     text = (
         f"The size of the path at {len(unsure)} frames, mostly {first} to {last}, is hardly tied to that of the rest: "
-        "it may be 20 % too large or too small. "
+        "it may be 10 to 20 % too large or too small. "
         "Too little is seen from both sides. Move sideways there, turn more slowly, or come back to the place."
     )
     return [Reason(ReasonCode.SCALE, Level.USABLE, text, first, last)]
@@ -223,23 +223,12 @@ def _measurements(rows: Sequence[FrameRow], measured: Measured) -> list[Reason]:
     return [_about_all(rows, ReasonCode.MEASUREMENTS, Level.USABLE, text)]
 
 
-def _loose_joins(system: System, trajectories: Trajectories) -> list[Reason]:
-    """Find frames that are joined to most others by links alone that hardly know their scale."""
-    own = trajectories.S_world_submap.keys()
+def _loosely_joined(system: System, trajectories: Trajectories) -> set[int]:
+    """Return the frames that are joined to most others by links alone that hardly know their scale."""
     main = trajectories.main.index.tolist()
     submap_of = {i: system.poses[system.numbers.number_of(i)].submap_id for i in main}
-    parts = [part for part in system.atlas.components(sure=True) if own & set(part)]
-    frames = [[i for i in main if submap_of[i] in part] for part in parts]
-    beyond = sorted(i for part in sorted(frames, key=len)[:-1] for i in part)
-    if not beyond:
-        return []
-    first, last = beyond[0], beyond[-1]
-    sigma = max(k.sigma_scale for k in system.atlas.believed if {k.a, k.b} <= own and not k.is_sure)
-    text = (
-        f"Frames {first} to {last} are joined to the others by a scale that is known to {100 * sigma:.1f} % only. "
-        "They may be too large or too small by three times as much. A recording that returns there would fix it."
-    )
-    return [Reason(ReasonCode.SCALE, Level.USABLE, text, first, last)]
+    frames = [{i for i in main if submap_of[i] in part} for part in system.atlas.components(sure=True)]
+    return set(main) - max(frames, key=len)
 
 
 def _replaced(system: System, trajectories: Trajectories, claims: Claims | None) -> list[Reason]:
@@ -259,7 +248,7 @@ def _replaced(system: System, trajectories: Trajectories, claims: Claims | None)
         was = earlier.keyframe_poses(np.array([index_of[i] for i in index]))[:, :3, 3]
         now = np.array([centres[i] for i in index])
         path, aligned = float(np.linalg.norm(np.diff(now, axis=0), axis=1).sum()), umeyama(was, now)
-        noise = MIN_JUMP_DEPTHS * _median_depth(system, trajectories, index[len(index) // 2])
+        noise = MIN_MOTION_DEPTHS * _median_depth(system, trajectories, index[len(index) // 2])
         if isinstance(aligned, Failure) or aligned.rmse < max(MAX_PATH_CHANGE * path, noise):
             continue
         first, last = min(index), max(index)
@@ -280,7 +269,7 @@ def _still(system: System, trajectories: Trajectories) -> list[Reason]:
         if len(rows) < 2:
             continue
         moved = float(np.ptp(main.T_world_cam[rows, :3, 3], axis=0).max())
-        if moved > MIN_JUMP_DEPTHS * _median_depth(system, trajectories, int(main.index[rows[0]])):
+        if moved > MIN_MOTION_DEPTHS * _median_depth(system, trajectories, int(main.index[rows[0]])):
             first, last = sorted((int(main.index[rows[0]]), int(main.index[rows[-1]])))
             text = (
                 f"From frame {first} to {last} most of the image stands still, but the camera moves in the map. "

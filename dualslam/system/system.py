@@ -16,7 +16,7 @@ from dualslam.core.config.settings import Config
 from dualslam.core.events import EventKind
 from dualslam.core.interfaces import SubmapGraph, VisualOdometry
 from dualslam.core.jobs import JobKind
-from dualslam.core.noise_model import START_POINTS
+from dualslam.core.noise_model import GROUP, START_POINTS
 from dualslam.core.types import BoolArray, Failure, FailureReason, Features, Frame, FrameStatus, Start, Track, View
 from dualslam.core.walk_news import WalkNews
 from dualslam.map.frame_numbers import FrameNumbers
@@ -474,12 +474,12 @@ class System:
         """Note lost frames that share too little with what has a pose, and with each other, to be posed by anything.
 
         Frames that are blurred alike match each other. Tracking may reach them along neighbours that share enough, from
-        a frame with a pose or from two that could start a map.
+        a frame with a pose. Or there are so many of them that their own map could know its scale, and be joined.
         """
         before, self._before = self._before, view
         n = 0 if before is None or not (is_lost or self._apart) else self._n_shared(before.features, view.features)
         enough = self._state.config.tracking.min_inliers
-        if n >= enough and not (is_lost and self._apart and n < START_POINTS):
+        if n >= enough and not (is_lost and self._apart and (n < START_POINTS or len(self._apart) < GROUP)):
             self.blank -= self._apart
             self._apart = set()
         elif is_lost:

@@ -55,7 +55,7 @@ def test_a_run_leaves_all_that_it_should(
     assert pages == f"open {out / 'report.html'} and {out / 'map.html'}"
     judged = json.loads((out / "summary.json").read_text())["verdict"]
     assert (judged["level"], judged["reasons"]) == ("good", [])
-    assert judged["scores"]["jump"] < 2.0
+    assert judged["scores"]["jump"] < 0.1
     assert len(rows_of(out)) == len((out / "trajectory.txt").read_text().splitlines()) == N_FRAMES
     assert np.load(out / "covariances.npz")["covariance"].shape == (N_FRAMES, 6, 6)
     assert all(row["in_main_map"] == "1" and row["status"] == "tracked" for row in rows_of(out))

@@ -107,6 +107,15 @@ def test_the_way_can_be_unsure_where_the_depths_are_firm() -> None:
     assert relative_scales(submap, [middle, ids], [], EXACT)[0, 1] < between[0, 1] / 3
 
 
+def test_a_keyframe_that_is_loose_alone_leaves_the_way_sure() -> None:
+    _, submap = solved("street", 0)
+    ids = np.array(sorted(submap.keyframes))
+    firm, loose = (
+        relative_scales(submap, [ids[8:14], ids], [], EXACT | {int(ids[11]): noise})[0, 1] for noise in (1.0, 30.0)
+    )
+    assert loose < 1.3 * firm
+
+
 def test_a_break_in_the_middle_leaves_each_half_unsure_against_the_other_alone() -> None:
     submap = thinned(solved("street", 0)[1], 12 * FRAME_STEP, 4)
     ids = np.array(sorted(submap.keyframes))

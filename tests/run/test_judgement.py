@@ -206,16 +206,19 @@ def test_frames_of_a_strided_run_are_neighbours() -> None:
     assert (reason.code, reason.first_frame, reason.last_frame) == (ReasonCode.SCALE, 182, 238)
 
 
-@pytest.mark.parametrize(("is_sure", "level"), [(True, Level.GOOD), (False, Level.USABLE)])
-def test_a_join_of_unsure_scale_makes_the_smaller_part_doubtful(is_sure: bool, level: Level) -> None:
-    system = run(ahead(), lost=(60,))
+@pytest.mark.parametrize(
+    ("is_sure", "lost", "level"), [(True, 60, Level.GOOD), (False, 60, Level.USABLE), (False, 12, Level.GOOD)]
+)
+def test_a_join_of_unsure_scale_makes_the_smaller_part_doubtful(is_sure: bool, lost: int, level: Level) -> None:
+    """Unless it is a tenth of the frames or less."""
+    system = run(ahead(), lost=(lost,))
     old, new = sorted(system.atlas.submaps)
-    unsure = Link(old, new, np.eye(4), 1e-3 * np.eye(7), LinkKind.RECOVERY, (), 0, 61, is_sure=is_sure)
+    unsure = Link(old, new, np.eye(4), 1e-3 * np.eye(7), LinkKind.RECOVERY, (), 0, lost + 1, is_sure=is_sure)
     system.atlas.link(unsure)
     verdict = judged(system)
     assert verdict.level is level
-    assert verdict.doubt_about(59) == ("" if level is Level.GOOD else "scale")
+    assert verdict.doubt_about(lost - 1) == ("" if level is Level.GOOD else "scale")
     assert verdict.doubt_about(100) == ""
     # A loop that knows its scale joins the same two.
-    system.atlas.link(Link(old, new, np.eye(4), 1e-8 * np.eye(7), LinkKind.LOOP, keyframe_a=0, keyframe_b=61))
+    system.atlas.link(Link(old, new, np.eye(4), 1e-8 * np.eye(7), LinkKind.LOOP, keyframe_a=0, keyframe_b=lost + 1))
     assert judged(system) == Verdict(Level.GOOD)

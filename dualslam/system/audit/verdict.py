@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from dualslam.core.noise_model import ROBUST_N, TINY
+from dualslam.core.noise_model import ROBUST_N, STRETCH_S, TINY
 from dualslam.core.types import FloatArray
 
 MAX_REASONS = 3
@@ -94,31 +94,27 @@ class Verdict:
 LEAST_OF_MEDIAN = 0.5
 """Share of the median speed, or interval, that is expected at least: a camera at rest starts to move, and timestamps
 repeat or come late in turns."""
+STRETCH_FRAMES = 20
+"""Of a stretch, at least: 10 a second. Between rarer ones a camera may truly change its speed so much, and timestamps
+may be in another unit."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Steps:
-    """The steps between N consecutive frames of a trajectory."""
-
-    ratio: FloatArray  # (N - 1,): speed of each step over the speed about it
-    excess: FloatArray  # (N - 1,): length beyond what the speed about it explains, in the trajectory's unit
-
-
-def measure_steps(times_s: FloatArray, centres: FloatArray) -> Steps:
+def measure_jumps(times_s: FloatArray, centres: FloatArray) -> FloatArray:
     """Compare each step of a trajectory with the median of those about it.
 
     - `times_s` (N,): ascending; some may repeat.
     - `centres` (N, 3): of the camera.
+
+    Returns (N - 1,): excess of each step's speed, as a share of the way of `STRETCH_S` at the speed about it.
     """
     interval_s = np.diff(times_s)
-    least_s = LEAST_OF_MEDIAN * float(np.median(interval_s[interval_s > 0])) if (interval_s > 0).any() else 1e-9
-    interval_s = np.maximum(interval_s, least_s)
-    length = np.linalg.norm(np.diff(centres, axis=0), axis=1)
-    speed = length / interval_s
+    usual_s = float(np.median(interval_s[interval_s > 0])) if (interval_s > 0).any() else 1e-9
+    interval_s = np.maximum(interval_s, LEAST_OF_MEDIAN * usual_s)
+    speed = np.linalg.norm(np.diff(centres, axis=0), axis=1) / interval_s
     if len(speed) <= 2 * ROBUST_N:
-        return Steps(np.zeros(len(speed)), np.zeros(len(speed)))
+        return np.zeros(len(speed))
     padded = np.concatenate([np.full(ROBUST_N, np.nan), speed, np.full(ROBUST_N, np.nan)])
     window = np.lib.stride_tricks.sliding_window_view(padded, 2 * ROBUST_N + 1)
     about = np.nanmedian(np.delete(window, ROBUST_N, axis=1), axis=1)
     expected = np.maximum(about, LEAST_OF_MEDIAN * float(np.median(speed)))
-    return Steps(speed / np.maximum(expected, TINY), length - expected * interval_s)
+    return np.asarray((speed / np.maximum(expected, TINY) - 1.0) / max(STRETCH_S / usual_s, STRETCH_FRAMES))
