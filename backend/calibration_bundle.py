@@ -6,12 +6,12 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import pairwise
 
 import numpy as np
 
 from dualslam.backend.final_refinement import LEAST_NOISE
-from dualslam.backend.point_refinement import huber
-from dualslam.backend.schur import Lens, Optimum, State, System, optimise
+from dualslam.backend.schur import Lens, Loss, Optimum, State, System, optimise
 from dualslam.core.bundle import BundleProblem
 from dualslam.core.camera.corrected import LensCorrection
 from dualslam.core.chi_square import MEDIAN_CHI2
@@ -29,8 +29,8 @@ class CalibratedOptimum:
     """Where the cost is least."""
 
     T_submap_kf: FloatArray
-    """(K, 4, 4): the problem's keyframes; the first stays where it was, and so does its distance from the one farthest
-    from it."""
+    """(K, 4, 4): the problem's keyframes; the fixed one stays where it was, and so does its distance from the one
+    farthest from it."""
     correction: FloatArray  # (5,): of the camera as it was given
     covariance: FloatArray  # (5, 5): of the correction, by the Hessian, prior and all
     follows: FloatArray  # (K, 6, 5): with a change d of the correction the poses go to ``T_submap_kf exp(follows @ d)``
@@ -87,42 +87,38 @@ class _HeldLens(CorrectedLens):
         return by_ray, by_lens[:, :, :0]
 
 
-def optimise_with_camera(
-    problem: BundleProblem, start: FloatArray, prior: FloatArray, robust_k: float
-) -> CalibratedOptimum:
+def optimise_with_camera(problem: BundleProblem, start: FloatArray, prior: FloatArray, loss: Loss) -> CalibratedOptimum:
     """Minimise over poses, points and correction, without the few points that end behind a camera.
 
-    - `problem`: in the rectified pixels of the camera as it was given; `fixed` is not looked at.
+    - `problem`: in the rectified pixels of the camera as it was given; of each map the first pose is fixed.
     - `start`, `prior` (5,): the correction to begin at, and the prior sigmas of its parts about zero.
-    - `robust_k`: Huber threshold in sigmas.
 
     Raises `SolverError` if there is no optimum, or nothing fixes the correction.
     """
-    problem = replace(problem, fixed=np.arange(len(problem.T_submap_kf)) == 0)
     lens = CorrectedLens(problem.K, np.diag(prior**-2.0))
-    kept, found = _in_front(problem, robust_k, lens, start)
-    state = _in_unit_of(problem, found.state)
+    kept, found = _in_front(problem, loss, lens, start)
+    state = _in_unit_of(kept, problem, found.state)
     return CalibratedOptimum(
         state.T_submap_kf,
         state.lens,
-        *System(kept, partial(huber, k=robust_k), lens).about_lens(state),
-        _noise_ratio(kept, state),
+        *System(kept, loss, lens).about_lens(state),
+        noise_ratio(kept, state),
         found.cost_before,
         found.cost_after,
-        partial(_poses_under, replace(kept, T_submap_kf=state.T_submap_kf, xyz_mu=state.xyz_mu), robust_k),
+        partial(_poses_under, replace(kept, T_submap_kf=state.T_submap_kf, xyz_mu=state.xyz_mu), loss),
     )
 
 
-def _poses_under(problem: BundleProblem, robust_k: float, correction: FloatArray) -> FloatArray:
+def _poses_under(problem: BundleProblem, loss: Loss, correction: FloatArray) -> FloatArray:
     """Return the poses (K, 4, 4) at which the cost is least, were the camera another one."""
     lens = _HeldLens(problem.K, correction)
-    _, found = _in_front(problem, robust_k, lens, np.zeros(0))
-    return _in_unit_of(problem, found.state).T_submap_kf
+    kept, found = _in_front(problem, loss, lens, np.zeros(0))
+    return _in_unit_of(kept, problem, found.state).T_submap_kf
 
 
-def _in_front(problem: BundleProblem, robust_k: float, lens: Lens, start: FloatArray) -> tuple[BundleProblem, Optimum]:
+def _in_front(problem: BundleProblem, loss: Loss, lens: Lens, start: FloatArray) -> tuple[BundleProblem, Optimum]:
     """Minimise, and again without the points that are behind a camera; return what is left, and its optimum."""
-    p, loss = problem, partial(huber, k=robust_k)
+    p = problem
     for _ in range(MAX_TRIES + 1):
         found = optimise(p, loss, MAX_ITERATIONS, TOLERANCE, lens, start)
         T, xyz = found.state.T_submap_kf, found.state.xyz_mu
@@ -140,18 +136,24 @@ def _in_front(problem: BundleProblem, robust_k: float, lens: Lens, start: FloatA
     raise SolverError("points go behind their cameras again and again")
 
 
-def _in_unit_of(problem: BundleProblem, state: State) -> State:
-    """Return a state in the unit in which the pose farthest from the first is as far from it as in the problem."""
-    centre = problem.T_submap_kf[0, :3, 3]
-    distance = np.linalg.norm(problem.T_submap_kf[:, :3, 3] - centre, axis=1)
-    far = int(np.argmax(distance))
-    T = state.T_submap_kf.copy()
-    unit = distance[far] / np.linalg.norm(T[far, :3, 3] - centre)
-    T[:, :3, 3] = centre + unit * (T[:, :3, 3] - centre)
-    return State(T, centre + unit * (state.xyz_mu - centre), state.lens)
+def _in_unit_of(kept: BundleProblem, problem: BundleProblem, state: State) -> State:
+    """Return a state of `kept` whose maps have the units of `problem`: by the pose farthest from each one's first."""
+    T, xyz = state.T_submap_kf.copy(), state.xyz_mu.copy()
+    begins = np.append(np.flatnonzero(problem.fixed), len(T))
+    first = np.zeros(len(xyz), np.int64)
+    first[kept.point] = kept.kf
+    for begin, end in pairwise(begins.tolist()):
+        centre = problem.T_submap_kf[begin, :3, 3]
+        distance = np.linalg.norm(problem.T_submap_kf[begin:end, :3, 3] - centre, axis=1)
+        far = begin + int(np.argmax(distance))
+        unit = distance.max() / np.linalg.norm(T[far, :3, 3] - centre)
+        own = (first >= begin) & (first < end)
+        T[begin:end, :3, 3] = centre + unit * (T[begin:end, :3, 3] - centre)
+        xyz[own] = centre + unit * (xyz[own] - centre)
+    return State(T, xyz, state.lens)
 
 
-def _noise_ratio(problem: BundleProblem, state: State) -> float:
+def noise_ratio(problem: BundleProblem, state: State) -> float:
     """Return the ratio of the typical residual to its sigma."""
     p, T = problem, state.T_submap_kf
     p_cam = np.einsum("rji,rj->ri", T[p.kf, :3, :3], state.xyz_mu[p.point] - T[p.kf, :3, 3])

@@ -12,6 +12,7 @@ import numpy as np
 from dualslam.atlas.stored_map import StoredMap, tidy
 from dualslam.backend.final_refinement import refine_submap, settle_ties
 from dualslam.backend.local_ba import adjust_and_prune
+from dualslam.backend.self_calibration import calibrate_together
 from dualslam.build.checks import check_config, check_given
 from dualslam.build.parts import atlas_solver, graph_maker, new_calibration, new_initialiser, place_parts, window_solver
 from dualslam.build.walks import recovery_parts
@@ -153,6 +154,9 @@ def build_system(
             new_odometry=faults.around_odometry(live.new_odometry),
             new_relocaliser=faults.around_odometry(live.new_relocaliser),
             calibration=calibration,
+            calibrate_together=partial(
+                calibrate_together, config=config.calibration, robust_k=config.graph.robust_k, seed=config.seed
+            ),
             shutter=shutter,
             scene=scene,
             walk_watch=watch,

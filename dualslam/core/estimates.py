@@ -45,6 +45,9 @@ class GraphEstimate:
 
 MAX_PRIOR_SIGMAS = 6.0
 """A correction farther from the given calibration than this says that something else is wrong."""
+MAX_PATH_CHANGE = 0.02
+"""RMS distance between two paths of the same keyframes, over their length. A run whose error is as large is not right
+(docs/bench.md). Errors of other causes add to it in squares: a wrong camera may have half of the square."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -235,6 +235,12 @@ It returns the correction of the calibration that was given, or why it cannot be
 the correction that the camera has, if it was estimated.
 """
 
+JointCalibrator = Callable[
+    [list["Submap"], "Camera", FloatArray | None], tuple[CalibrationEstimate, list["Submap"]] | Failure
+]
+"""Asks several submaps about the camera that they share, as a `SelfCalibrator` does one; also returns copies of them,
+changed to it. Raises `InputError` if the correction has no inverse somewhere in the image."""
+
 SubmapAdjuster = Callable[["Submap"], None]
 """Refines all poses and points of a submap in place, in batch. Raises `SolverError` where the solver fails."""
 

@@ -13,10 +13,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from dualslam.core.camera.base import Camera
-from dualslam.core.camera.corrected import correct, correction_of
+from dualslam.core.camera.corrected import correct
 from dualslam.core.config.settings import CalibrationConfig
 from dualslam.core.errors import InputError, SolverError
-from dualslam.core.estimates import CalibrationEstimate
+from dualslam.core.estimates import MAX_PATH_CHANGE, CalibrationEstimate
 from dualslam.core.interfaces import SelfCalibrator, SubmapAdjuster, SubmapGraph
 from dualslam.core.noise_model import GROWN
 from dualslam.core.types import Failure, FailureReason, Features, FloatArray, Keyframe, View
@@ -25,14 +25,12 @@ from dualslam.map.submap import Submap
 UPDATE_SIGMA_RATIO = 0.7
 """A camera may have been changed by an answer less sure than `max_focal_sigma`. It is changed again, however little, if
 the new sigma of the focal length is below this share of that answer's: twice the information. One that was sure stays,
-until another is significantly different."""
+until another is significantly different, or all maps of the run answer together."""
 AT_LOSS = 1.05
 """A map that may be at its end is asked once more, where it has so many times the keyframes of when it was asked: the
 next one begins with what it says. Lower, single frames without a pose would each cost a question."""
 FEWEST_KEYFRAMES = 10
 """Of a map that is asked before it is old enough: since the run ends, or since a lost map waits to be joined to it."""
-FAR_SIGMAS = 2.0
-"""Standard deviations of the focal length's prior: a correction beyond them is to be confirmed by later keyframes."""
 SURE_SIGMA = 0.01
 """Of the log focal length: an answer that is no surer than this is not the last, however little was known before."""
 
@@ -86,6 +84,8 @@ class Calibration:
         self._asked_with: dict[int, int] = {}
         self._refined_in: int | None = None
         self._covariance = covariance
+        self._is_confirmed = False
+        self._path_change = 0.0  # by the last answer that was not taken
         self._estimated: set[int] = set()  # the submaps that have said something of the camera
 
     @property
@@ -109,7 +109,7 @@ class Calibration:
         `is_waited_for`: a lost map waits to be joined to it, which no similarity does under a wrong camera. Then it is
         asked as soon as it may answer.
         """
-        if self._refined_in not in (None, submap.id):
+        if self._is_confirmed or self._refined_in not in (None, submap.id):
             return False  # what a longer submap said of the lens is not put at risk by a shorter one
         first = FEWEST_KEYFRAMES if is_waited_for else self._config.first_keyframes
         return self._config.refine and len(submap.keyframes) >= self._due_at.get(submap.id, first)
@@ -120,19 +120,21 @@ class Calibration:
         has_grown = n >= AT_LOSS * self._asked_with.get(submap.id, 0)
         return config.refine and self._refined_in is None and n >= config.first_keyframes and has_grown
 
+    @property
+    def is_refuted(self) -> bool:
+        """Whether the images have refuted the given camera: it was changed, or is to blame for much of the error."""
+        return self._covariance is not None or self._path_change > MAX_PATH_CHANGE / 2
+
     def is_due_at_end(self, submap: Submap, is_waited_for: bool) -> bool:
-        """Whether to ask a submap as the run ends: it has not said anything, or is to confirm a large correction.
+        """Whether to ask a submap as the run ends: as long as none has estimated the camera, one that said nothing.
 
         `is_waited_for`: a lost map waits to be joined to it. Then it is asked also if it has merely grown.
         """
-        n, off = len(submap.keyframes), abs(float(correction_of(self._camera).log_focal))
-        has_grown = n >= AT_LOSS * self._asked_with.get(submap.id, 0)
-        if self._refined_in == submap.id:
-            is_open = has_grown and (is_waited_for or off > FAR_SIGMAS * self._config.log_focal_sigma)
-        else:
-            says_more = submap.id not in self._estimated or (is_waited_for and has_grown)
-            is_open = self._refined_in is None and says_more
-        return self._config.refine and is_open and n >= FEWEST_KEYFRAMES
+        n = len(submap.keyframes)
+        says_more = is_waited_for and n >= AT_LOSS * self._asked_with.get(submap.id, 0)
+        is_first = self._refined_in is None and submap.id not in self._estimated
+        may_speak = self._refined_in in (None, submap.id)
+        return self._config.refine and n >= FEWEST_KEYFRAMES and (is_first or (may_speak and says_more))
 
     def estimate(self, submap: Submap) -> CalibrationEstimate | Failure:
         """Return what a submap says of the camera; nothing is changed."""
@@ -145,16 +147,36 @@ class Calibration:
         return CalibrationJob(submap.copy(), copies, self._camera, self._covariance)
 
     def note(self, job: CalibrationJob, failure: Failure) -> None:
-        """Note that a question had no clear answer: where the motion said nothing yet, the next comes sooner."""
+        """Note that a question changed nothing: where the motion said nothing yet, the next comes sooner.
+
+        A camera that an answer of twice the information does not change is confirmed. Nothing more is asked until all
+        maps are asked together.
+        """
+        asked, sigma = job.submap.id, self.log_focal_sigma
+        self.note_change(failure)
         if failure.numbers:
-            self._estimated.add(job.submap.id)
+            self._estimated.add(asked)
         if failure.reason is FailureReason.DEGENERATE:
-            self._said_nothing(job.submap.id, len(job.submap.keyframes))
+            self._said_nothing(asked, len(job.submap.keyframes))
+        elif failure.reason is FailureReason.CHI_SQUARE and asked == self._refined_in and sigma is not None:
+            self._is_confirmed = failure.numbers["log_focal_sigma"] < UPDATE_SIGMA_RATIO * sigma
+
+    def note_change(self, found: CalibrationEstimate | Failure) -> None:
+        """Note by how much an answer that was not taken would change the path."""
+        self._path_change = found.numbers.get("path_change", 0.0)
 
     def take(self, answer: CalibrationAnswer) -> None:
         """Let the frames to come be rectified by the camera that was found."""
         self._camera, self._refined_in, self._covariance = answer.camera, answer.submap.id, answer.covariance
         self._estimated.add(answer.submap.id)
+
+    def take_together(self, estimate: CalibrationEstimate) -> bool:
+        """Take what all maps of a run say together, if it is significant or has twice the information; say whether."""
+        present, found = self.log_focal_sigma, float(np.sqrt(estimate.covariance[0, 0]))
+        taken = estimate.accepted or (present is not None and found < UPDATE_SIGMA_RATIO * present)
+        if taken:
+            self._camera, self._covariance = correct(self._camera, estimate.correction), estimate.covariance
+        return taken
 
     def _asked(self, submap_id: int, n: int) -> None:
         self._asked_with[submap_id] = n

@@ -6,16 +6,13 @@ import numpy as np
 
 from dualslam.core.camera.calibrated_size import find_calibrated_size
 from dualslam.core.camera.mapped import own_camera
-from dualslam.core.estimates import MAX_PRIOR_SIGMAS
+from dualslam.core.estimates import MAX_PATH_CHANGE, MAX_PRIOR_SIGMAS
 from dualslam.core.events import Event, EventKind
 from dualslam.system.audit.verdict import Level, ReasonCode
 from dualslam.system.system import System
 
 MAX_FOCAL_SIGMA = 0.03
 """Standard deviation of the logarithm of the focal length."""
-MAX_PATH_CHANGE = 0.02
-"""RMS distance between two paths of the same keyframes, over their length. A run whose error is as large is not right
-(docs/bench.md). Errors of other causes add to it in squares: a wrong camera may have half of the square."""
 MIN_FOCAL_CHANGE, MAX_FOCAL_SIGMAS = 0.1, 4.0
 """Of the logarithm of the focal length against the one that the map was made with until then: two sigmas of what a
 data sheet is off, and known to be more. Its own sigma is that of one submap: of 44 answers on 7-Scenes 1 % are 3.7
@@ -73,7 +70,7 @@ def _by_answers(answers: list[Event]) -> tuple[Level, str] | None:
         shown = f"a focal length {100 * abs(np.expm1(log_focal)):.0f} % {longer} than the calibration says"
     check = "Check that the calibration is of this camera, lens and image size."
     if last.event is EventKind.CALIBRATED:
-        if not is_far:
+        if not is_far and data["prior_sigmas"] <= MAX_PRIOR_SIGMAS:
             return None
         return Level.USABLE, f"The images show {shown}. The rest of the map is too short to confirm it. {check}"
     if path_change**2 < MAX_PATH_CHANGE**2 / 2.0:

@@ -6,6 +6,7 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
+from dualslam.core.estimates import MAX_PATH_CHANGE
 from dualslam.core.events import EventKind
 from dualslam.core.geometry import sim3
 from dualslam.core.geometry.umeyama import umeyama
@@ -13,7 +14,7 @@ from dualslam.core.noise_model import UNSURE_SCALE
 from dualslam.core.trajectory import Trajectory
 from dualslam.core.types import Failure, FloatArray, FrameStatus, IntArray
 from dualslam.map.frame_records import FrameRow
-from dualslam.run.camera_judgement import MAX_PATH_CHANGE, judge_camera
+from dualslam.run.camera_judgement import judge_camera
 from dualslam.run.claims import Claims, claims_in_atlas
 from dualslam.run.measuring import MANY_REJECTED, Measured
 from dualslam.run.results import Trajectories

@@ -113,7 +113,8 @@ class Registering:
         """
         record, shown = self._state.record, Counter[int]()
         for event in record.events.of_kind(EventKind.CALIBRATED):
-            assert event.submap is not None
+            if event.submap is None:  # all maps took that camera
+                continue
             submap = record.atlas.submaps[event.submap]
             apart = set(event.data["lost"]) - set(record.atlas.component_of(submap.id))
             on = Counter(pose.keyframe_id for pose in record.own_poses() if pose.submap_id in apart)

@@ -327,6 +327,8 @@ class System:
             self._endings.archive(state.live, "end of sequence")
         if last is not None and not interrupted and not state.localises:
             own = self.atlas.submaps.keys() - self._earlier
+            maps = [self.atlas.submaps[m] for m in sorted(own)]
+            self._calibrations.settle([each for each in maps if len(each.keyframes) > 1], last)
             self._places.join_rest(own, last)
             link_overlaps(state.record, self._connections, state.config, own, last)
             if self._registers:

@@ -9,6 +9,7 @@ import pytest
 
 from dualslam.backend import self_calibration
 from dualslam.backend.self_calibration import (
+    calibrate_together,
     choose_window,
     estimate_calibration,
     estimate_correction,
@@ -70,6 +71,66 @@ def wrong_camera(f: float = 1.03) -> PinholeCamera:
 
 def sigmas_off(found: LensCorrection, truth: FloatArray, covariance: FloatArray) -> FloatArray:
     return np.abs(found.vector - truth) / np.sqrt(np.diag(covariance))
+
+
+def with_false_matches(submap: Submap, seed: int) -> Submap:
+    """Let a tenth of all features lie 5 px too far out; sigmas are ten times the noise, so none is large by these."""
+    rng = np.random.default_rng(seed)
+    for k, keyframe in submap.keyframes.items():
+        uv, outward = keyframe.features.uv_px.copy(), keyframe.features.uv_px - TRUE.K[:2, 2]
+        false = rng.random(len(uv)) < 0.1
+        uv[false] += 5.0 * outward[false] / np.linalg.norm(outward[false], axis=1, keepdims=True)
+        submap.keyframes[k] = replace(keyframe, features=make_features(uv, np.full(len(uv), 4.0)))
+    return submap
+
+
+class TestTogether:
+    def test_all_maps_of_a_run_find_their_lens_and_change_to_it(self) -> None:
+        """One of them drives straight ahead, and could not say it by itself."""
+        camera = wrong_camera()
+        maps = [with_false_matches(make_submap(camera, turning=i < 2, seed=i), i) for i in range(3)]
+        before = [submap.copy() for submap in maps]
+        found = calibrate_together(maps, camera, None, config=CONFIG)
+        assert found
+        estimate, changed = found
+        assert estimate.accepted
+        assert abs(estimate.correction.log_focal + np.log(1.03)) < 0.004
+        truth = np.array([-np.log(1.03), 0, 0, 0, 0])
+        assert sigmas_off(estimate.correction, truth, estimate.covariance).max() < 2.0
+        expected = correct(camera, estimate.correction)
+        for submap, old, new in zip(maps, before, changed, strict=True):
+            np.testing.assert_array_equal(submap.K, camera.K)  # it is not changed
+            np.testing.assert_array_equal(new.K, expected.K)
+            ids = np.arange(30)
+            T, T_old = new.keyframe_poses(ids), old.keyframe_poses(ids)
+            np.testing.assert_array_equal(T[0], T_old[0])
+            lengths = [np.linalg.norm(each[:, :3, 3] - T[0, :3, 3], axis=1) for each in (T, T_old)]
+            assert lengths[0][lengths[1].argmax()] == pytest.approx(lengths[1].max())
+            uv, _ = new.observed_pixels(np.arange(len(new.observations)))
+            raw, _ = old.observed_pixels(np.arange(len(old.observations)))
+            np.testing.assert_allclose(uv, expected.rectify(raw)[0])
+
+    def test_the_maps_get_better(self) -> None:
+        camera, truth = wrong_camera(), make_submap(TRUE, turning=True).keyframe_poses(np.arange(30))[:, :3, 3]
+        maps = [make_submap(camera, turning=True, seed=i) for i in range(2)]
+        for submap in maps:
+            adjust_submap(submap, 1.345)
+        found = calibrate_together(maps, camera, None, config=CONFIG)
+        assert found
+        for old, new in zip(maps, found[1], strict=True):
+            errors = [
+                np.sqrt((distances_when_aligned(m.keyframe_poses(np.arange(30))[:, :3, 3], truth) ** 2).mean())
+                for m in (old, new)
+            ]
+            assert errors[1] < 0.3 * errors[0]
+
+    def test_maps_without_turns_say_nothing(self) -> None:
+        camera = wrong_camera()
+        found = calibrate_together(
+            [make_submap(camera, turning=False, seed=i) for i in range(2)], camera, None, config=CONFIG
+        )
+        assert isinstance(found, Failure)
+        assert found.reason is FailureReason.DEGENERATE
 
 
 class TestEstimate:

@@ -46,6 +46,14 @@ def test_a_camera_counts_by_what_it_does_to_the_path(log_focal: float, path_chan
     assert judge_camera(system)[1]["camera"] == path_change  # type: ignore[arg-type]
 
 
+def test_another_lens_that_was_taken_over_leaves_a_run_usable() -> None:
+    """Its focal length is as given, its distortion is not."""
+    system = FakeSystem({0: np.eye(4)})
+    answer = {"log_focal": 0.03, "log_focal_sigma": 0.005, "k1": -0.28, "path_change": 0.0, "prior_sigmas": 9.4}
+    system.events.add(TAKEN, 60, 2.0, None, **answer)
+    assert level_of(system) is Level.USABLE
+
+
 @pytest.mark.parametrize(
     ("later", "level"),
     [

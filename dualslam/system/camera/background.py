@@ -43,6 +43,7 @@ class Calibrations:
         self._record, self._buffer = state.record, state.buffer
         self._calibration, self._new_graph = state.parts.calibration, state.parts.new_graph
         self._recoveries, self._connections = recoveries, connections
+        self._ask_together = state.parts.calibrate_together
 
     def ask_if_due(self, live: VisualOdometry, now: FrameStamp) -> None:
         """Ask the live submap about its camera where it is time to."""
@@ -71,9 +72,35 @@ class Calibrations:
             return
         with self._record.timer.measure("calibration"):
             found = self._calibration.estimate(live.submap)
+            self._calibration.note_change(found)
         if found.numbers:
             kept, reason = EventKind.CALIBRATION_KEPT, "asked at the end of the run"
             self._record.event(kept, now, live.submap.id, reason=reason, **found.numbers)
+
+    def settle(self, submaps: list[Submap], now: FrameStamp) -> None:
+        """Let all maps of the run, as they are at its end, say which camera they share, and change to it.
+
+        Where they have not refuted the calibration that was given, it is more exact than what they would say.
+        """
+        calibration = self._calibration
+        if not calibration.is_refuted or not submaps:
+            return
+        with self._record.timer.measure("calibration"):
+            try:
+                found = self._ask_together(submaps, calibration.camera, calibration.covariance)
+            except (InputError, SolverError) as error:
+                log.warning("maps keep the camera that one of them has found: %s", error)
+                return
+            if isinstance(found, Failure) or not calibration.take_together(found[0]):
+                return
+            estimate, changed = found
+            rectified = partial(rectified_where_possible, camera=calibration.camera)
+            for submap, after in zip(submaps, changed, strict=True):
+                before = submap.copy()
+                submap.take_over(after)
+                self._connections.follow(before, submap, now)
+                self._record.change_pixels(submap.id, lambda _: rectified)
+        self._record.event(EventKind.CALIBRATED, now, lost=[], **estimate.numbers)
 
     def _is_waited_for(self, live: VisualOdometry) -> bool:
         """Whether a lost map is to be joined to the live one."""

@@ -109,6 +109,19 @@ def test_an_answer_for_a_map_that_was_lost_meanwhile_changes_nothing(in_time: Sy
     assert all(found.submap != lost.id for found in system.events.of_kind(EventKind.CALIBRATED))
 
 
+@pytest.mark.slow
+def test_at_the_end_all_maps_take_the_camera_that_they_find_together(in_time: System) -> None:
+    asked, *_, last = in_time.events.of_kind(EventKind.CALIBRATED)
+    assert asked.submap == 0
+    assert last.submap is None
+    off = [abs(event.data["log_focal"] + np.log(WRONG)) for event in (asked, last)]
+    assert off[1] < off[0] or off[1] < last.data["log_focal_sigma"]
+    assert last.data["log_focal_sigma"] < 0.7 * asked.data["log_focal_sigma"]
+    camera = in_time._state.parts.calibration.camera
+    for submap in in_time.atlas.submaps.values():
+        np.testing.assert_array_equal(submap.K, camera.K)
+
+
 @pytest.mark.parametrize("is_lost", [False, True])
 def test_without_a_clock_a_map_that_ends_has_the_answer_first(in_time: System, is_lost: bool) -> None:
     """It is to come after a hundred frames; the run, or the map, ends five after the question."""

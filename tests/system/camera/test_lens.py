@@ -19,7 +19,7 @@ from dualslam.core.estimates import CalibrationEstimate
 from dualslam.core.events import EventKind
 from dualslam.core.geometry import se3, so3
 from dualslam.core.types import Failure, FailureReason, Features, FloatArray, Frame, View
-from dualslam.map.lens import Calibration
+from dualslam.map.lens import Calibration, answer
 from dualslam.map.submap import Submap
 from dualslam.system.camera.shutter_watch import turn_rates
 from dualslam.system.system import System
@@ -104,21 +104,54 @@ class TestRefine:
         assert bool(calibration.refine(submap)) is changes
         assert correction_of(calibration.camera) == (RIGHT_AGAIN if changes else near)
 
-    @pytest.mark.parametrize(("wrong", "due"), [(1.25, True), (1.03, False)])
-    def test_a_large_correction_is_to_be_confirmed_at_the_end_by_a_map_that_has_grown(
-        self, wrong: float, due: bool
+    @pytest.mark.parametrize(
+        ("accepted", "sigma", "taken"), [(True, 0.012, True), (False, 0.004, True), (False, 0.007, False)]
+    )
+    def test_an_answer_of_all_maps_is_taken_if_it_is_significant_or_much_surer(
+        self, accepted: bool, sigma: float, taken: bool
     ) -> None:
-        found = replace(estimate_of(LensCorrection(log_focal=-np.log(wrong)), True), covariance=0.005**2 * np.eye(5))
-        submap, larger = (make_submap(wrong_camera(wrong), turning=True, n=n) for n in (12, 13))
+        near = LensCorrection(log_focal=RIGHT_AGAIN.log_focal + 0.01)
+        calibration = calibration_that_finds(replace(estimate_of(near, True), covariance=0.008**2 * np.eye(5)))
+        assert calibration.refine(make_submap(wrong_camera(WRONG), turning=True, n=12))
+        found = replace(estimate_of(RIGHT_AGAIN, accepted), covariance=sigma**2 * np.eye(5))
+        assert calibration.take_together(found) is taken
+        assert correction_of(calibration.camera) == (RIGHT_AGAIN if taken else near)
+        assert calibration.log_focal_sigma == pytest.approx(sigma if taken else 0.008)
+
+    @pytest.mark.parametrize(("path_change", "refuted"), [(0.03, True), (0.004, False)])
+    def test_a_camera_that_explains_much_of_the_path_is_refuted_without_a_change(
+        self, path_change: float, refuted: bool
+    ) -> None:
+        found = replace(estimate_of(RIGHT_AGAIN, False), path_change=path_change)
+        calibration = calibration_that_finds(found)
+        assert not calibration.is_refuted
+        submap = make_submap(wrong_camera(WRONG), turning=True, n=12)
+        job = calibration.ask(submap, {})
+        failure = calibration.refine(submap)
+        assert isinstance(failure, Failure)
+        calibration.note(job, failure)
+        assert calibration.is_refuted is refuted
+
+    @pytest.mark.parametrize(("sigma", "asks"), [(0.005, False), (0.007, True)])
+    def test_a_camera_that_twice_the_information_does_not_change_is_asked_for_no_more(
+        self, sigma: float, asks: bool
+    ) -> None:
+        answers = [
+            replace(estimate_of(RIGHT_AGAIN, True), covariance=0.008**2 * np.eye(5)),
+            replace(estimate_of(RIGHT_AGAIN, False), covariance=sigma**2 * np.eye(5)),
+        ]
         calibration = Calibration(
-            wrong_camera(wrong), CalibrationConfig(), lambda *_: found, lambda submap: adjust_submap(submap, 1.345)
+            wrong_camera(WRONG), CalibrationConfig(), lambda *_: answers.pop(0), lambda s: adjust_submap(s, 1.345)
         )
-        assert calibration.is_due_at_end(submap, False)
-        assert calibration.refine(submap)
-        assert not calibration.is_due_at_end(submap, False)
-        assert calibration.is_due_at_end(larger, False) is due
-        assert calibration.is_due_at_end(larger, True)
-        assert not calibration.is_due_at_end(submap, True)
+        submap = make_submap(wrong_camera(WRONG), turning=True, n=12)
+        job = calibration.ask(submap, {})
+        found = answer(job, calibration, new_graph)
+        assert found
+        calibration.take(found)
+        failure = calibration.refine(submap)
+        assert isinstance(failure, Failure)
+        calibration.note(calibration.ask(submap, {}), failure)
+        assert calibration.is_due(make_submap(TRUE, turning=True, n=30)) is asks
 
     def test_an_answer_is_asked_for_with_what_was_known_of_the_one_before(self) -> None:
         asked_with: list[FloatArray | None] = []
