@@ -116,8 +116,8 @@ def _ask(atlas: Atlas, submap: Submap, links: Mapping[int, Link]) -> _Known:
         return _Known(positions, np.zeros((n_parts, n_parts)), np.full(len(ids), np.nan), place_of)
     stretches = list(stretches_of(submap).values())
     size_mu = np.array([np.linalg.norm(submap.keyframe_poses(s)[:, :3, 3].std(axis=0)) for s in stretches])
-    depth_mu = np.array([np.median(submap.depths_in(k)) if len(submap.seen_in(k)) else MIN_DEPTH_MU for k in ids])
-    measurable_mu = GATE_SIGMAS / UNSURE_SCALE * np.nanmedian(list(usual.values())) * depth_mu
+    depth_mu = [np.median(submap.depths_in(k)) if len(submap.seen_in(k)) else 0.0 for k in ids]
+    measurable_mu = GATE_SIGMAS / UNSURE_SCALE * np.nanmedian(list(usual.values())) * np.maximum(depth_mu, MIN_DEPTH_MU)
     between = relative_scales(submap, stretches, list(places.values()), excess)
     return _Known(positions, between, np.minimum(size_mu / measurable_mu, 1.0), place_of)
 

@@ -93,6 +93,14 @@ def test_where_pixels_fit_worse_less_is_claimed_of_what_lies_about() -> None:
     assert claims[ids[0]].sigma_position_rel == sharp[ids[0]].sigma_position_rel
 
 
+def test_a_keyframe_with_its_points_behind_it_claims_nothing_negative() -> None:
+    submap = run()[0].atlas.submaps[0].copy()
+    last = max(submap.keyframes)
+    submap.T_submap_kf[last][:3, :3] @= np.diag([-1.0, 1.0, -1.0])
+    assert np.median(submap.depths_in(last)) < 0
+    assert claims_of(submap)[last].sigma_scale > 0
+
+
 def test_where_nothing_is_seen_on_both_sides_the_scale_is_not_known() -> None:
     submap = run()[0].atlas.submaps[0]
     ids = sorted(submap.keyframes)
