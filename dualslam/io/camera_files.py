@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import Any
 
 from dualslam.core.camera.base import Camera
+from dualslam.core.camera.corrected import CorrectedCamera, LensCorrection
 from dualslam.core.camera.models import MODELS, FovCamera, PinholeCamera, RadTanCamera, camera_from_dict
 from dualslam.core.errors import InputError
 from dualslam.io.camera_build import (
@@ -105,7 +106,9 @@ def _of_mapping(content: dict[str, Any], where: str, images_px: Callable[[], Siz
         return camera_of_mapping(content, where, images_px)
     if content["model"] in (PinholeCamera.model, RadTanCamera.model):
         content = with_y_down(content, where)
-    return make_camera(where, lambda: camera_from_dict(content))
+    camera = make_camera(where, lambda: camera_from_dict(content))
+    # What one run has found is what another is given: that may correct it once more, and not take this correction off.
+    return CorrectedCamera.of(camera, LensCorrection()) if isinstance(camera, CorrectedCamera) else camera
 
 
 # --- COLMAP

@@ -18,6 +18,7 @@ import cv2
 import numpy as np
 import yaml
 
+from dualslam.core.camera.base import Camera
 from dualslam.core.config.files import CONFIG as CONFIG
 from dualslam.core.errors import OutputError
 from dualslam.core.events import Event
@@ -44,6 +45,7 @@ REPORT = "report.html"
 MAP_PAGE = "map.html"
 GROUND_TRUTH = "groundtruth.txt"
 MASK = "mask.png"
+CAMERA = "camera.yaml"
 SUBMAPS = "submaps"
 SAMPLES = "samples"
 MAP = "map"
@@ -54,14 +56,14 @@ FRAME_COLUMNS = (
 )
 _FILES = (
     *(TRAJECTORY, TRAJECTORY_KITTI, TRAJECTORY_KITTI_FRAMES, FRAMES, EVENTS, DECISIONS, SCHEDULE, SUMMARY, CONFIG),
-    *(REPORT, MAP_PAGE, GROUND_TRUTH, MASK, *METRIC_FILES, *TRAJECTORIES_MERGED),
+    *(REPORT, MAP_PAGE, GROUND_TRUTH, MASK, CAMERA, *METRIC_FILES, *TRAJECTORIES_MERGED),
 )
 _RESULTS = (
-    *(CONFIG, EVENTS, DECISIONS, SCHEDULE, FRAMES, TRAJECTORY, f"{SUBMAPS}/", SUMMARY, GROUND_TRUTH, MASK, f"{MAP}/"),
-    *(MAP_PAGE, REPORT),
+    *(CONFIG, EVENTS, DECISIONS, SCHEDULE, FRAMES, TRAJECTORY, f"{SUBMAPS}/", SUMMARY, GROUND_TRUTH, MASK, CAMERA),
+    *(f"{MAP}/", MAP_PAGE, REPORT),
 )
 """In the order in which they are listed for a person."""
-_NOT_OF_EVERY_RUN = frozenset({f"{SUBMAPS}/", GROUND_TRUTH, MASK, MAP_PAGE, DECISIONS})
+_NOT_OF_EVERY_RUN = frozenset({f"{SUBMAPS}/", GROUND_TRUTH, MASK, CAMERA, MAP_PAGE, DECISIONS})
 _SUBMAP_NAME = re.compile(r"\d+\.txt")
 SAMPLE_NAME = re.compile(r"\d+\.jpg")
 _MAP_NAME = re.compile(r"[\w.-]+\.(npz|json)")
@@ -182,6 +184,10 @@ class RunFolder:
     def write_mask(self, hidden: BoolArray) -> None:
         """Write ``mask.png``: 0 for the pixels (H, W) that show no scene, 255 for the others."""
         write_bytes(self.path / MASK, cv2.imencode(".png", np.where(hidden, 0, 255).astype(np.uint8))[1].tobytes())
+
+    def write_camera(self, camera: Camera) -> None:
+        """Write ``camera.yaml``: a calibration file, which another run can be given."""
+        write_text(self.path / CAMERA, yaml.safe_dump(camera.to_dict(), sort_keys=False))
 
     def write_map_page(self, page: str) -> None:
         """Write ``map.html``."""

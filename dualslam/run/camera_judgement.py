@@ -72,7 +72,8 @@ def _by_answers(answers: list[Event]) -> tuple[Level, str] | None:
     if last.event is EventKind.CALIBRATED:
         if not is_far and data["prior_sigmas"] <= MAX_PRIOR_SIGMAS:
             return None
-        return Level.USABLE, f"The images show {shown}. The rest of the map is too short to confirm it. {check}"
+        again = "The map was made with that. Run again with --camera and this run's camera.yaml, or check"
+        return Level.USABLE, f"The images show {shown}. {again} the calibration."
     if path_change**2 < MAX_PATH_CHANGE**2 / 2.0:
         return None
     is_wrong = path_change > MAX_PATH_CHANGE or data["prior_sigmas"] > MAX_PRIOR_SIGMAS

@@ -459,6 +459,8 @@ def _write_results(
     summary["hidden_share"] = 0.0 if hidden is None else float(hidden.mean())
     if hidden is not None:
         folder.write_mask(hidden)
+    if system.log_focal_sigma is not None:
+        folder.write_camera(system.camera)
     if measured is not None:
         summary["measurements"] = measured.summary()
     elif refused:

@@ -12,10 +12,12 @@ import numpy as np
 import pycolmap
 import pytest
 
+from dualslam.core.camera.corrected import LensCorrection, correct
 from dualslam.core.camera.models import DivisionCamera, FovCamera, KannalaBrandtCamera, PinholeCamera, RadTanCamera
 from dualslam.core.camera.sphere import DoubleSphereCamera, EucmCamera, OmniCamera
 from dualslam.core.errors import InputError
 from dualslam.io import read_camera_file
+from dualslam.io.run_folder import RunFolder
 
 PINHOLE = PinholeCamera(752, 480, 458.0, 457.0, 367.0, 248.0)
 RADTAN = RadTanCamera(752, 480, 458.0, 457.0, 367.0, 248.0, k1=-0.28, k2=0.07, p1=0.0002, p2=0.00002)
@@ -753,3 +755,15 @@ def test_a_file_that_does_not_say_the_size_of_its_images(tmp_path: Path) -> None
         read_camera_file(path, lambda: (376, 240))
     with pytest.raises(InputError, match="does not say the size of the images; add image_width"):
         read_camera_file(path)
+
+
+def test_the_camera_that_a_run_found_is_given_to_another_which_may_correct_it_once_more(tmp_path: Path) -> None:
+    found = correct(PINHOLE, LensCorrection(0.03, 2.0, -1.0, -0.1, 0.02))
+    with RunFolder(tmp_path / "run") as folder:
+        folder.write_camera(found)
+    camera = read_camera_file(tmp_path / "run" / "camera.yaml")
+    rays = np.random.default_rng(0).uniform([-0.5, -0.4, 1], [0.5, 0.4, 1], (50, 3))
+    np.testing.assert_allclose(camera.project(rays), found.project(rays))
+    np.testing.assert_allclose(camera.rectify(found.project(rays))[0], found.rectify(found.project(rays))[0])
+    again = correct(camera, LensCorrection(log_focal=0.01))
+    assert again.K[0, 0] == pytest.approx(PINHOLE.fx * np.exp(0.03 + 0.01))
