@@ -18,6 +18,7 @@ from dualslam.backend.sim3_graph import Sim3Edge, Sim3Solution, optimise_sim3
 from dualslam.core.atlas_problem import AtlasProblem, AtlasSolution
 from dualslam.core.chi_square import MEDIAN_CHI2, squared_distances
 from dualslam.core.errors import SolverError
+from dualslam.core.geometry import sim3
 from dualslam.core.types import FloatArray, IntArray
 from dualslam.map.submap import Submap
 
@@ -65,7 +66,7 @@ class GtsamAtlasSolver:
         if (label != label[first]).any():
             raise SolverError("nothing ties some keyframes to the first: they have no relative covariance")
         graph.take_in_drift()
-        found = np.zeros((len(label), 7, 7))
+        found = np.zeros((len(label), sim3.DOF, sim3.DOF))
         others = np.delete(np.arange(len(label)), first)
         found[others] = graph.optimise().relative_covariances([(first, n) for n in others.tolist()])
         return found
@@ -128,7 +129,7 @@ class _Graph:
             return 1.0, chi2
         C, r = self._innovations(self.optimise(), tested)
         chi2[tested] = squared_distances(r, C)
-        ratio2 = max(1.0, float(np.sort(chi2[tested])[(len(tested) - 1) // 2]) / MEDIAN_CHI2[7])
+        ratio2 = max(1.0, float(np.sort(chi2[tested])[(len(tested) - 1) // 2]) / MEDIAN_CHI2[sim3.DOF])
         for i in np.flatnonzero(odometry).tolist():
             self.edges[i] = replace(self.edges[i], covariance=ratio2 * self.edges[i].covariance)
         return float(np.sqrt(ratio2)), chi2
@@ -150,7 +151,7 @@ class _Graph:
         C = np.empty_like(P)
         for i, e in enumerate(edges):
             L = np.linalg.cholesky(e.covariance)
-            share = np.eye(7) - np.linalg.solve(L, np.linalg.solve(L, P[i]).T)
+            share = np.eye(sim3.DOF) - np.linalg.solve(L, np.linalg.solve(L, P[i]).T)
             values, vectors = np.linalg.eigh(0.5 * (share + share.T))
             back = vectors / np.maximum(values, LEAST_REDUNDANCY) @ vectors.T
             C[i] = L @ back @ L.T

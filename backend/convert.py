@@ -13,7 +13,7 @@ from __future__ import annotations
 import gtsam
 import numpy as np
 
-from dualslam.core.geometry import se3
+from dualslam.core.geometry import se3, so3
 from dualslam.core.types import FloatArray, IntArray
 
 _POSE_PREFIX = ord("x") << 56
@@ -100,7 +100,7 @@ def insert_points(values: gtsam.Values, landmark_ids: IntArray, xyz: FloatArray)
 
 
 def _nearest_rotation(R: FloatArray) -> FloatArray:
-    if np.abs(R @ R.T - np.eye(3)).max() < 1e-9:
+    if np.abs(R @ R.T - so3.IDENTITY).max() < 1e-9:
         return R
     U, _, Vt = np.linalg.svd(R)
     return np.asarray(U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt, float)

@@ -16,7 +16,7 @@ import numpy as np
 from dualslam.backend.noise import GAUGE_SIGMA
 from dualslam.core.chi_square import huber_weights
 from dualslam.core.errors import SolverError
-from dualslam.core.geometry import se3, so3
+from dualslam.core.geometry import se3, sim3, so3
 from dualslam.core.noise_model import MIN_DEPTH_MU
 from dualslam.core.types import FloatArray, IntArray
 from dualslam.map.submap import Submap
@@ -47,7 +47,9 @@ def edge_covariances(
         if k not in submap.keyframes:
             raise SolverError(f"keyframe {k} is not in submap {submap.id}: no covariance of an edge to it")
     ids = np.array(sorted(submap.keyframes), np.int64)
-    covariances = np.array([_covariance(submap, ids, *pair, robust_k, held) for pair in pairs]).reshape(-1, 7, 7)
+    covariances = np.array([_covariance(submap, ids, *pair, robust_k, held) for pair in pairs]).reshape(
+        -1, sim3.DOF, sim3.DOF
+    )
     if not np.isfinite(covariances).all():
         raise SolverError(f"submap {submap.id}: its factors give no covariance of some edges between keyframes")
     return covariances
@@ -68,29 +70,30 @@ def _covariance(
     n = len(window)
     a, b = np.searchsorted(window, (first, second)).tolist()
     kf, point, x_cam, J_pose, J_point = _linearise(submap, window, robust_k)
-    information = np.zeros((n, 6, n, 6))
+    information = np.zeros((n, se3.DOF, n, se3.DOF))
     loose = np.repeat([LOOSE_ROTATION_RAD**-2, LOOSE_TRANSLATION_MU**-2], 3)
     information[np.arange(n), :, np.arange(n), :] = np.diag(loose)
-    own = np.zeros((n, 6, 6))
+    own = np.zeros((n, se3.DOF, se3.DOF))
     np.add.at(own, kf, J_pose.transpose(0, 2, 1) @ J_pose)
     information[np.arange(n), :, np.arange(n), :] += own
     _add_relative_poses(information, submap, window, held)
     n_points = int(point.max()) + 1 if len(point) else 0
     H_points = np.zeros((n_points, 3, 3))
     np.add.at(H_points, point, J_point.transpose(0, 2, 1) @ J_point)
-    cross = np.zeros((n_points, 3, n, 6))  # one observation of a point in a keyframe at most
+    cross = np.zeros((n_points, 3, n, se3.DOF))  # one observation of a point in a keyframe at most
     cross[point, :, kf] = J_point.transpose(0, 2, 1) @ J_pose
-    flat = cross.reshape(n_points, 3, 6 * n)
+    flat = cross.reshape(n_points, 3, se3.DOF * n)
     # How a point moves with the poses: dp = moves @ dc.
     moves = np.asarray(-np.linalg.inv(H_points) @ flat, np.float64)
-    system = information.reshape(6 * n, 6 * n) + flat.reshape(-1, 6 * n).T @ moves.reshape(-1, 6 * n)
+    size = se3.DOF * n
+    system = information.reshape(size, size) + flat.reshape(-1, size).T @ moves.reshape(-1, size)
     R = se3.rotation(submap.keyframe_poses(window))
     units = [_unit(c, kf, point, x_cam, R[c], moves, n) for c in (a, b)]
     system += np.outer(units[0], units[0]) / GAUGE_SIGMA**2
-    free = np.delete(np.arange(6 * n), np.arange(6 * a, 6 * a + 6))
-    read = np.zeros((7, 6 * n))
-    read[:6, 6 * b : 6 * b + 6] = np.eye(6)
-    read[6] = units[1]
+    free = np.delete(np.arange(size), np.arange(se3.DOF * a, se3.DOF * (a + 1)))
+    read = np.zeros((sim3.DOF, size))
+    read[: se3.DOF, se3.DOF * b : se3.DOF * b + se3.DOF] = np.eye(se3.DOF)
+    read[-1] = units[1]
     system = 0.5 * (system + system.T)[np.ix_(free, free)]
     try:
         found = read[:, free] @ np.linalg.solve(system, read[:, free].T)
@@ -148,13 +151,13 @@ def _unit(
 ) -> FloatArray:
     """Return the derivative (6 n,) of the mean log-depth of what keyframe `c` of the window sees, by all poses."""
     seen = np.flatnonzero(kf == c)
-    derivative = np.zeros(6 * n)
+    derivative = np.zeros(se3.DOF * n)
     if not len(seen):
         return derivative
     x = x_cam[seen]
     derivative += (np.einsum("r,i,rij->j", 1 / x[:, 2], R[:, 2], moves[point[seen]])) / len(seen)
     own = np.concatenate((so3.hat(x)[:, 2], np.broadcast_to([0.0, 0.0, -1.0], x.shape)), axis=1)
-    derivative[6 * c : 6 * c + 6] += (own / x[:, 2:]).mean(0)
+    derivative[se3.DOF * c : se3.DOF * c + se3.DOF] += (own / x[:, 2:]).mean(0)
     return derivative
 
 

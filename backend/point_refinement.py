@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from dualslam.backend.observability import projection_jacobian, reproject, sum_products
+from dualslam.core.geometry import so3
 from dualslam.core.noise_model import TINY
 from dualslam.core.types import FloatArray, IntArray
 from dualslam.map.submap import Submap
@@ -75,7 +76,7 @@ def refine_points(
         weight[~front] = 0.0
         J = projection_jacobian(K, R, safe, sigma_px)
         H, b = normal_equations(J, weight, r, point, n)
-        H += (DAMPING * np.trace(H, axis1=1, axis2=2) + TINY)[:, None, None] * np.eye(3)
+        H += (DAMPING * np.trace(H, axis1=1, axis2=2) + TINY)[:, None, None] * so3.IDENTITY
         xyz = xyz - np.linalg.solve(H, b[:, :, None])[:, :, 0]
     return best
 

@@ -256,7 +256,7 @@ class System:
         solved = None if reduced is None else self._solve(reduced, FIRST_DAMPING)
         if solved is None:
             raise SolverError("the lens has no covariance: the system is not definite")
-        follows = np.zeros((len(state.T_submap_kf), 6, len(state.lens)))
+        follows = np.zeros((len(state.T_submap_kf), se3.DOF, len(state.lens)))
         follows[self._free] = -solved[1]
         return np.asarray(np.linalg.inv(solved[2]), np.float64), follows
 
@@ -271,10 +271,10 @@ class System:
         n, m = len(self._free), len(state.lens)
         information = np.zeros((m, m)) if self._lens is None else self._lens.information
         reduced = _Reduced(
-            np.zeros((n, self._band + 1, 6, 6)),
-            np.zeros((n, 6, m)),
+            np.zeros((n, self._band + 1, se3.DOF, se3.DOF)),
+            np.zeros((n, se3.DOF, m)),
             information.copy(),
-            np.zeros((n, 6)),
+            np.zeros((n, se3.DOF)),
             information @ state.lens,
         )
         points = []
@@ -296,19 +296,19 @@ class System:
             factor = cholesky_banded(band, overwrite_ab=True, lower=True, check_finite=False)
         except np.linalg.LinAlgError:
             return None
-        right = np.concatenate((reduced.g_pose[:, :, None], reduced.border), axis=2).reshape(6 * n, 1 + m)
+        right = np.concatenate((reduced.g_pose[:, :, None], reduced.border), axis=2).reshape(se3.DOF * n, 1 + m)
         solved = cho_solve_banded((factor, True), right, check_finite=False)
-        border = reduced.border.reshape(6 * n, m)
+        border = reduced.border.reshape(se3.DOF * n, m)
         corner = reduced.corner - border.T @ solved[:, 1:]
         g_lens = reduced.g_lens - border.T @ solved[:, 0]
-        return -solved[:, 0].reshape(n, 6), solved[:, 1:].reshape(n, 6, m), corner, g_lens
+        return -solved[:, 0].reshape(n, se3.DOF), solved[:, 1:].reshape(n, se3.DOF, m), corner, g_lens
 
 
 def _eliminate(reduced: _Reduced, linear: _Linear, n_points: int, damping: float) -> tuple[FloatArray, FloatArray]:
     """Add what a chunk tells of poses and lens; return its points' inverse information (P, 3, 3) and gradient."""
     n = len(reduced.g_pose)
     V, g = normal_equations(linear.J_point.transpose(1, 2, 0), linear.weight, linear.residuals, linear.point, n_points)
-    V_inverse = np.asarray(np.linalg.inv(V + damping * np.eye(3)), np.float64)
+    V_inverse = np.asarray(np.linalg.inv(V + damping * so3.IDENTITY), np.float64)
     root = np.linalg.cholesky(V_inverse)
     root_g = np.einsum("pji,pj->pi", root, g)
     weighted_lens = linear.J_lens * linear.weight[:, None, None]
@@ -332,7 +332,7 @@ def _eliminate(reduced: _Reduced, linear: _Linear, n_points: int, damping: float
         reduced.border[poses] += np.add.reduceat(border, first)
     reduced.blocks[poses, 0] += np.add.reduceat((weighted @ linear.J_pose)[by_pose], first)
     ends = np.searchsorted(pose, np.arange(n + 1))
-    tied = bsr_array((Y, point, ends), shape=(6 * n, 3 * n_points))
+    tied = bsr_array((Y, point, ends), shape=(se3.DOF * n, 3 * n_points))
     product = tied @ tied.T
     row, column = np.repeat(np.arange(n), np.diff(product.indptr)), product.indices
     lower = row >= column
@@ -343,11 +343,11 @@ def _eliminate(reduced: _Reduced, linear: _Linear, n_points: int, damping: float
 def _band_matrix(blocks: FloatArray, damping: float) -> FloatArray:
     """Return LAPACK's lower band storage of blocks (N, B + 1, 6, 6), each at [column, row - column]."""
     n, width = blocks.shape[:2]
-    band = np.zeros((6 * width, 6 * n), order="F")
-    for a in range(6):
-        for b in range(6):
+    band = np.zeros((se3.DOF * width, se3.DOF * n), order="F")
+    for a in range(se3.DOF):
+        for b in range(se3.DOF):
             first = int(a < b)  # what is above the diagonal is left out
-            begin = 6 * first + a - b
-            band[begin::6, b::6][: width - first] = blocks[:, first:, a, b].T
+            begin = se3.DOF * first + a - b
+            band[begin :: se3.DOF, b :: se3.DOF][: width - first] = blocks[:, first:, a, b].T
     band[0] += damping
     return band

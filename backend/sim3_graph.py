@@ -55,14 +55,14 @@ class Sim3Solution:
 
         Raises `SolverError` if the solver cannot tell.
         """
-        found = np.empty((len(pairs), 7, 7))
+        found = np.empty((len(pairs), sim3.DOF, sim3.DOF))
         try:
             marginals = gtsam.Marginals(self._graph, self._values)
             for i, (first, second) in enumerate(pairs):
                 joint = marginals.jointMarginalCovariance([int(first), int(second)])
                 C = np.block([[np.asarray(joint.at(a, b)) for b in (first, second)] for a in (first, second)])
                 S_second_first = sim3.inverse(self.S_world_node[second]) @ self.S_world_node[first]
-                J = np.concatenate((-sim3.adjoint(S_second_first), np.eye(7)), axis=1)
+                J = np.concatenate((-sim3.adjoint(S_second_first), np.eye(sim3.DOF)), axis=1)
                 found[i] = J @ C @ J.T
         except GTSAM_ERRORS as error:
             raise SolverError(f"no covariances between {len(pairs)} pairs of Sim(3) nodes: {error}") from error
@@ -116,7 +116,7 @@ def optimise_sim3(
         for e in edges:
             S = convert.to_similarity3(e.S_first_second)
             graph.push_back(gtsam.BetweenFactorSimilarity3(int(e.first), int(e.second), S, gaussian(e.covariance)))
-        gauge = gaussian(GAUGE_SIGMA**2 * np.eye(7))
+        gauge = gaussian(GAUGE_SIGMA**2 * np.eye(sim3.DOF))
         for name, S_world_node in held.items():
             graph.push_back(gtsam.PriorFactorSimilarity3(int(name), convert.to_similarity3(S_world_node), gauge))
         for name, S_world_node in nodes.items():

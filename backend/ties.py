@@ -17,7 +17,7 @@ from dualslam.backend.convert import pose_key, to_pose3
 from dualslam.backend.factor_index import OUTSIDE, Plan
 from dualslam.backend.noise import GAUGE_SIGMA, PixelNoise, pose_sigmas
 from dualslam.backend.observability import find_components
-from dualslam.core.geometry import se3
+from dualslam.core.geometry import se3, so3
 from dualslam.core.noise_model import BASELINE_SIGMA, GROUP, MIN_DEPTH_MU, MIN_LANDMARKS
 from dualslam.core.types import FloatArray, IntArray
 from dualslam.map.anchors import RelativePose
@@ -95,14 +95,14 @@ class Gauge:
         if T is None:
             return False
         off = se3.inverse(self.T_submap_first) @ T
-        if np.abs(off[:3, :3] - np.eye(3)).max() > MOVED_TOLERANCE:
+        if np.abs(se3.rotation(off) - so3.IDENTITY).max() > MOVED_TOLERANCE:
             return True
-        if np.linalg.norm(off[:3, 3]) > MOVED_TOLERANCE * max(1.0, self.baseline_mu):
+        if np.linalg.norm(se3.translation(off)) > MOVED_TOLERANCE * max(1.0, self.baseline_mu):
             return True
         other = submap.T_submap_kf.get(self.second) if self.second is not None else None
         if other is None:
             return False
-        length = float(np.linalg.norm(other[:3, 3] - T[:3, 3]))
+        length = float(np.linalg.norm(se3.translation(other) - se3.translation(T)))
         return abs(length - self.baseline_mu) > MOVED_TOLERANCE * self.baseline_mu
 
 
@@ -127,7 +127,7 @@ def choose_gauge(submap: Submap, current: Gauge | None, pose: Callable[[int], Fl
     T_first = pose(first)
 
     def distance(k: int) -> float:
-        return float(np.linalg.norm(pose(k)[:3, 3] - T_first[:3, 3]))
+        return float(np.linalg.norm(se3.translation(pose(k)) - se3.translation(T_first)))
 
     def serves(k: int | None) -> TypeGuard[int]:
         return k is not None and k in live and k != first

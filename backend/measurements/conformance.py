@@ -30,7 +30,7 @@ TIMES_S = (1.0, 2.5)
 
 
 def _poses(seed: int = 0) -> FloatArray:
-    return np.asarray(se3.exp(np.random.default_rng(seed).normal(size=(2, 6)) * np.repeat([0.6, 3.0], 3)))
+    return np.asarray(se3.exp(np.random.default_rng(seed).normal(size=(2, se3.DOF)) * np.repeat([0.6, 3.0], 3)))
 
 
 def _exact(cls: type[Measurement], T: FloatArray) -> tuple[Any, FloatArray, FloatArray]:
@@ -48,7 +48,7 @@ def check_declaration(cls: type[Measurement]) -> None:
     expect(set(cls.units) <= {"m", "rad"}, "units are m or rad")
     expect(np.shape(reading.sigmas) == r.shape, "one sigma for each component of the residual")
     expect(bool((np.asarray(reading.sigmas) > 0).all()), "sigmas are above 0")
-    expect(J.shape == (len(r), 6 * len(T) + len(shared)), f"the Jacobian has shape {J.shape}")
+    expect(J.shape == (len(r), se3.DOF * len(T) + len(shared)), f"the Jacobian has shape {J.shape}")
     expect(1 <= len(reading.times_s) <= 2, "a measurement is about one or two poses")
 
 
@@ -65,14 +65,14 @@ def check_zero_at_truth(cls: type[Measurement]) -> None:
 def check_jacobian(cls: type[Measurement]) -> None:
     """Check the Jacobian against central differences, away from the truth."""
     reading, _, _ = _exact(cls, _poses(2))
-    T = _poses(2) @ se3.exp(0.05 * np.random.default_rng(3).normal(size=(2, 6)))
+    T = _poses(2) @ se3.exp(0.05 * np.random.default_rng(3).normal(size=(2, se3.DOF)))
     T = T[: len(reading.times_s)]
     shared = 0.01 * np.ones(len(cls.shared_sigmas))
     J = reading.residual(T, shared)[1]
 
     def moved(step: FloatArray) -> FloatArray:
-        n = 6 * len(T)
-        return np.asarray(reading.residual(T @ se3.exp(step[:n].reshape(-1, 6)), shared + step[n:])[0])
+        n = se3.DOF * len(T)
+        return np.asarray(reading.residual(T @ se3.exp(step[:n].reshape(-1, se3.DOF)), shared + step[n:])[0])
 
     numerical = np.stack([moved(d) - moved(-d) for d in STEP * np.eye(J.shape[1])], axis=1) / (2 * STEP)
     off = float(np.abs(J - numerical).max())
@@ -108,7 +108,7 @@ def check_units(cls: type[Measurement]) -> None:
         if unit == "rad":
             expect(float(change[i]) < 1e-9, f"component {i} is in rad and depends on lengths")
         else:
-            by_length = np.abs(J[i, : 6 * len(T)].reshape(len(T), 2, 3)[:, 1]).max()
+            by_length = np.abs(J[i, : se3.DOF * len(T)].reshape(len(T), 2, 3)[:, 1]).max()
             expect(1e-3 < by_length < 10.0, f"component {i} changes by {by_length:.3g} m a metre")
 
 

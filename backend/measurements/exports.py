@@ -25,7 +25,7 @@ def export_graph(problem: MetricProblem, S_metric_node: FloatArray, terms: Seque
     Scales are taken as solved: an edge's translation and covariance are in metres. Positions are `GPSFactorArm` in
     GTSAM's file; g2o has no edge for them, nor have other kinds one here.
     """
-    T_metric_node = se3.from_parts(sim3.rotation(S_metric_node), S_metric_node[:, :3, 3])
+    T_metric_node = se3.from_parts(sim3.rotation(S_metric_node), sim3.translation(S_metric_node))
     scale = sim3.scale(S_metric_node)
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
     lines = []
@@ -35,7 +35,7 @@ def export_graph(problem: MetricProblem, S_metric_node: FloatArray, terms: Seque
     for e in problem.edges:
         unit = np.repeat([1.0, float(scale[e.second])], 3)
         C = unit[:, None] * e.covariance[:6, :6] * unit
-        T = se3.from_parts(sim3.rotation(e.S_first_second), scale[e.first] * e.S_first_second[:3, 3])
+        T = se3.from_parts(sim3.rotation(e.S_first_second), scale[e.first] * sim3.translation(e.S_first_second))
         graph.push_back(gtsam.BetweenFactorPose3(e.first, e.second, convert.to_pose3(T), gaussian(C)))
         information = np.linalg.inv(C)[np.ix_(SWAPPED, SWAPPED)]
         upper = " ".join(f"{x:.9g}" for x in information[np.triu_indices(6)])

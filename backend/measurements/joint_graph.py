@@ -193,7 +193,7 @@ class JointGraph:
             information = 2.0 * float(graph.linearize(self.values).eliminateMultifrontal().logDeterminant())
         except GTSAM_ERRORS:
             return float(np.inf)
-        n_scaled = 7 * sum(kind in ODOMETRY for kind in self.problem.edges.kind)
+        n_scaled = sim3.DOF * sum(kind in ODOMETRY for kind in self.problem.edges.kind)
         return float(2.0 * graph.error(self.values) + information + 2.0 * n_scaled * np.log(self.drift))
 
     def longest_run(self) -> list[float]:
@@ -383,12 +383,12 @@ class JointGraph:
         r, J = term.reading.residual(T, shared)
         by_node: dict[int, FloatArray] = {}
         for i, node in enumerate(term.nodes):
-            by_node[node] = by_node.get(node, 0.0) + J[:, 6 * i : 6 * i + 6] @ J_node[i]
+            by_node[node] = by_node.get(node, 0.0) + J[:, se3.DOF * i : se3.DOF * i + se3.DOF] @ J_node[i]
         found = list(by_node.values())
         if clock is not None:
-            found.append((J[:, : 6 * len(T)] @ np.concatenate(J_tau))[:, None])
+            found.append((J[:, : se3.DOF * len(T)] @ np.concatenate(J_tau))[:, None])
         if shared_key is not None:
-            found.append(J[:, 6 * len(T) :])
+            found.append(J[:, se3.DOF * len(T) :])
         return r, found
 
     # --- the result
@@ -397,7 +397,7 @@ class JointGraph:
         """Return squared residuals over their quantiles: of readings, then of doubtful connections."""
         whitened = [self._evaluate(t, self.values)[0] / t.reading.sigmas for t in self.terms]
         found = [float(r @ r) / CHI2_99[min(len(r), len(CHI2_99) - 1)] for r in whitened]
-        return np.array(found + [self._edge_chi2(i) / CHI2_999[7] for i in self.doubtful])
+        return np.array(found + [self._edge_chi2(i) / CHI2_999[sim3.DOF] for i in self.doubtful])
 
     def _edge_chi2(self, i: int) -> float:
         e = self.problem.edges[i]
@@ -407,7 +407,7 @@ class JointGraph:
 
     def _excess(self, graph: gtsam.NonlinearFactorGraph) -> float:
         """Return how far the joint cost exceeds its expectation, in its standard deviations."""
-        dof = max(sum(len(t.reading.sigmas) for t in self.terms if _counts(t)) - 7, 1)
+        dof = max(sum(len(t.reading.sigmas) for t in self.terms if _counts(t)) - sim3.DOF, 1)
         return float((2.0 * graph.error(self.values) - dof) / np.sqrt(2.0 * dof))
 
     def _covariances(self, graph: gtsam.NonlinearFactorGraph) -> Callable[[int], FloatArray]:
@@ -422,14 +422,14 @@ class JointGraph:
             A, _ = graph.linearize(self.values).jacobian()  # its columns are in the order of the keys
         root = solve_triangular(np.linalg.qr(A, mode="r"), np.eye(A.shape[1]))
         keys, n = sorted(self.values.keys()), len(self.problem.S_world_node)
-        ends = np.cumsum([7 if key < n else len(self.values.atVector(key)) for key in keys])
+        ends = np.cumsum([sim3.DOF if key < n else len(self.values.atVector(key)) for key in keys])
         rows = dict(zip(keys, np.split(root, ends[:-1]), strict=True))
         return lambda key: np.asarray(rows[key] @ rows[key].T)
 
     def _solution(self, graph: gtsam.NonlinearFactorGraph, excess: float) -> MetricSolution:
         covariance = self._covariances(graph)
         nodes = range(len(self.problem.S_world_node))
-        C = np.array([covariance(n) for n in nodes]).reshape(-1, 7, 7)
+        C = np.array([covariance(n) for n in nodes]).reshape(-1, sim3.DOF, sim3.DOF)
         S = np.array([convert.from_similarity3(self.values.atSimilarity3(n)) for n in nodes])
         count = [t for t in self.terms if _counts(t)]
         whitened: dict[str, list[FloatArray]] = {}
@@ -454,9 +454,9 @@ class JointGraph:
             clock_offset_s={n: self.offsets_s[i] + float(self.values.atVector(k)[0]) for n, (i, k) in clocks.items()},
             clock_sigma_s={n: float(np.sqrt(covariance(k)[0, 0])) for n, (_, k) in clocks.items()},
             metres_per_unit=per_world,
-            scale_sigma=float(np.sqrt(C[middle, 6, 6])),
+            scale_sigma=float(np.sqrt(C[middle, -1, -1])),
             rotation_sigma_rad=_largest_sigma(C[middle, :3, :3]),
-            translation_sigma_m=s * _largest_sigma(C[middle, 3:6, 3:6]),
+            translation_sigma_m=s * _largest_sigma(C[middle, 3 : se3.DOF, 3 : se3.DOF]),
             drift=self.drift,
             misfit_sigmas=excess,
             exports=export_graph(self.problem, S, count),

@@ -44,7 +44,7 @@ class RotationRate(Measurement):
     def residual(self, T: FloatArray, shared: FloatArray) -> Residual:
         """Return the rotation vector of the turn that is left over."""
         B = se3.rotation(self.mount.T_cam_body)
-        effect = np.eye(3) * (self.t_b_s - self.t_a_s) if self.bias_effect_s is None else self.bias_effect_s
+        effect = so3.IDENTITY * (self.t_b_s - self.t_a_s) if self.bias_effect_s is None else self.bias_effect_s
         unbiased = so3.exp(self.turn_rad) @ so3.exp(-effect @ shared)
         R_b_a = B.T @ se3.rotation(T[1]).T @ se3.rotation(T[0]) @ B
         r = so3.log((R_b_a @ unbiased).T)
@@ -91,7 +91,7 @@ class RotationRate(Measurement):
             R, effect = np.eye(3), np.zeros((3, 3))
             for step, turn in zip(steps.tolist(), so3.exp(rates * steps[:, None]), strict=True):
                 R = R @ turn
-                effect = turn.T @ effect + step * np.eye(3)
+                effect = turn.T @ effect + step * so3.IDENTITY
             sigma = raw[first].sigma_rad * float(np.sqrt((steps**2).sum()))
             done.append(cls(a, b, so3.log(R), sigma, raw[first].mount, effect))
         return done

@@ -225,7 +225,7 @@ def _by_rigid_fits(
     """Return the similarity that fits all readings best, from many rotations where some of them fix it."""
     terms = [t for t in attach(path, sources, offsets_s)[0] if not t.reading.shared_sigmas]
     poses = [sim3.act_on_pose(problem.S_world_node[list(t.nodes)], t.T_node_cam) for t in terms]
-    starts = [np.eye(3)]
+    starts = [so3.IDENTITY]
     if any(Gauge.ROTATION in t.reading.fixes for t in terms):
         signed = [np.diag(s) @ np.eye(3)[list(p)] for p in permutations(range(3)) for s in product((1, -1), repeat=3)]
         starts = [R for R in signed if np.linalg.det(R) > 0]
@@ -245,7 +245,7 @@ def _rigid_fit(terms: Sequence[Term], T_world: Sequence[FloatArray], S: FloatArr
     """Fit one similarity to readings by robust Gauss-Newton; return it and the robust cost."""
     cost = 0.0
     for _ in range(N_ROUNDS):
-        H, g, cost = 1e-6 * np.eye(7), np.zeros(7), 0.0
+        H, g, cost = 1e-6 * np.eye(sim3.DOF), np.zeros(sim3.DOF), 0.0
         for term, T_w in zip(terms, T_world, strict=True):
             T = sim3.act_on_pose(S, T_w)
             r, J = term.reading.residual(T, np.zeros(0))

@@ -89,7 +89,7 @@ class EdgeCovariances:
         return self._remembered(submap, pairs)
 
     def _remembered(self, submap: Submap, pairs: Sequence[tuple[int, int]]) -> FloatArray:
-        return np.array([self._known[(submap.id, *pair)].covariance for pair in pairs]).reshape(-1, 7, 7)
+        return np.array([self._known[(submap.id, *pair)].covariance for pair in pairs]).reshape(-1, sim3.DOF, sim3.DOF)
 
     def foresee(self, submap: Submap, pairs: Sequence[tuple[int, int]], held: frozenset[int]) -> None:
         """Compute in the background those that are missing."""
@@ -132,7 +132,7 @@ class EdgeCovariances:
                 kept.append((first, second))
             else:
                 del self._known[m, first, second]
-        units = np.ones((len(kept), 7))
+        units = np.ones((len(kept), sim3.DOF))
         units[:, 3:6] = sim3.scale(warp.at([second for _, second in kept]))[:, None]
         then = self._remembered(submap, kept)
         self._note(submap, kept, units[:, :, None] * then * units[:, None, :])

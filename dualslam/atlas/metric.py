@@ -14,7 +14,7 @@ from dualslam.atlas.skeleton import Skeleton, build_skeleton
 from dualslam.atlas.trajectory import FramePose, compose
 from dualslam.atlas.warp import Warp
 from dualslam.core.atlas_problem import AtlasEdges, AtlasSolver
-from dualslam.core.geometry import sim3
+from dualslam.core.geometry import se3, sim3
 from dualslam.core.metric_problem import MetricProblem, MetricSolution, pose_by_node
 from dualslam.core.trajectory import Trajectory
 from dualslam.core.types import FloatArray, IntArray
@@ -88,13 +88,15 @@ class MetricMap:
 
         - `S_frame_node`, `of_node` (N, 4, 4), (N, 7, 7): the nodes in a common frame, and their covariances.
         """
-        C = np.empty((len(self.frames), 6, 6))
+        C = np.empty((len(self.frames), se3.DOF, se3.DOF))
 
         def beside(frame: IntArray, node: IntArray) -> FloatArray:
             S_node_world = sim3.inverse(self.problem.S_world_node[node])
             T_node_cam = sim3.act_on_pose(S_node_world, self.frames.T_world_cam[frame])
             scale = sim3.scale(S_frame_node[node]).tolist()
-            J = np.array([pose_by_node(s, T) for s, T in zip(scale, T_node_cam, strict=True)]).reshape(-1, 6, 7)
+            J = np.array([pose_by_node(s, T) for s, T in zip(scale, T_node_cam, strict=True)]).reshape(
+                -1, se3.DOF, sim3.DOF
+            )
             return np.asarray(J @ of_node[node] @ J.swapaxes(1, 2))
 
         for m in self.skeleton.component:

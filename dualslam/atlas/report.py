@@ -100,7 +100,7 @@ def moves_of(skeleton: Skeleton, solution: AtlasSolution) -> list[Move]:
 
 def placed_by(skeleton: Skeleton, solution: AtlasSolution) -> dict[int, float]:
     """Return how far the keyframe that each submap's frame goes by has moved in the world."""
-    gone = np.linalg.norm(solution.S_world_node[:, :3, 3] - skeleton.problem.S_world_node[:, :3, 3], axis=1)
+    gone = np.linalg.norm(se3.translation(solution.S_world_node - skeleton.problem.S_world_node), axis=1)
     return {m: float(gone[row]) for m, row in skeleton.reference.items()}
 
 

@@ -183,8 +183,8 @@ def _within(
 def _along(rows: Mapping[int, range], T: FloatArray) -> tuple[AtlasEdges, dict[int, FloatArray]]:
     """Tie the nodes of submaps along the frames: in a tree no edge pulls at another, whatever covariances they have."""
     i = np.concatenate([np.arange(here.start, here.stop - 1) for here in rows.values()])
-    C = np.broadcast_to(np.eye(7), (len(i), 7, 7))
-    steps = {m: np.broadcast_to(np.eye(7), (len(here) - 1, 7, 7)) for m, here in rows.items()}
+    C = np.broadcast_to(np.eye(sim3.DOF), (len(i), sim3.DOF, sim3.DOF))
+    steps = {m: np.broadcast_to(np.eye(sim3.DOF), (len(here) - 1, sim3.DOF, sim3.DOF)) for m, here in rows.items()}
     return _edges_within(i, i + 1, sim3.inverse(T)[i] @ T[i + 1], C), steps
 
 
@@ -203,7 +203,7 @@ def _are_torn(own: FloatArray, now: FloatArray, covariances: FloatArray) -> Bool
     that.
     """
     off = sim3.log(sim3.inverse(own) @ now)
-    return squared_distances(off, covariances) > CHI2_999[7]
+    return squared_distances(off, covariances) > CHI2_999[sim3.DOF]
 
 
 def _inflated(T: FloatArray, depth: FloatArray, covariances: FloatArray) -> FloatArray:
@@ -214,10 +214,10 @@ def _inflated(T: FloatArray, depth: FloatArray, covariances: FloatArray) -> Floa
     - `depth` (E,): of the scene at the second.
     """
     motion = np.linalg.norm(so3.log(se3.rotation(T)), axis=1) + np.linalg.norm(se3.translation(T), axis=1) / depth
-    units = np.ones((len(T), 7))
+    units = np.ones((len(T), sim3.DOF))
     units[:, 3:6] = depth[:, None]
     model: FloatArray = (MODEL_SHARE * motion[:, None] * units) ** 2
-    return DRIFT**2 * covariances + model[:, :, None] * np.eye(7)
+    return DRIFT**2 * covariances + model[:, :, None] * np.eye(sim3.DOF)
 
 
 def _across(
@@ -228,7 +228,9 @@ def _across(
 ) -> AtlasEdges:
     """Make the factors of connections."""
     if not links:
-        return _edges_within(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 4, 4)), np.zeros((0, 7, 7)))
+        return _edges_within(
+            np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 4, 4)), np.zeros((0, sim3.DOF, sim3.DOF))
+        )
     ends: list[tuple[Node, Node]] = []
     for link in links:
         k_a, k_b = link.attached(atlas)

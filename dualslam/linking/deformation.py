@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from dualslam.core.config.settings import LinkingConfig
-from dualslam.core.geometry import se3, sim3
+from dualslam.core.geometry import se3, sim3, so3
 from dualslam.core.types import BoolArray, FloatArray
 from dualslam.linking.pairs import PairModel
 
@@ -46,9 +46,9 @@ def deformation_covariance(model: PairModel, deformation: float) -> FloatArray:
     """Return (7, 7) that a deformation, which bends all pairs together, adds to a link's covariance (right
     perturbation, new).
     """
-    distance = np.linalg.norm(model.pairs.xyz_new[:, None] - model.T_new_kf[None, :, :3, 3], axis=2)
+    distance = np.linalg.norm(model.pairs.xyz_new[:, None] - se3.translation(model.T_new_kf)[None], axis=2)
     sigma = np.repeat([ROTATION_SHARE, float(np.median(distance)), 1.0], [3, 3, 1]) * deformation
-    from_centre = sim3.adjoint(se3.from_parts(np.eye(3), model.centre_new))
+    from_centre = sim3.adjoint(se3.from_parts(so3.IDENTITY, model.centre_new))
     return np.asarray(from_centre @ np.diag(sigma**2) @ from_centre.T, np.float64)
 
 

@@ -174,7 +174,7 @@ def _carry(
     if not evidence.is_accepted:
         return refused
     held = [k for k in link.agreeing_keyframes.tolist() if k in new.keyframes]
-    about = sim3.adjoint(se3.from_parts(np.eye(3), se3.translation(new.keyframe_poses(held)).mean(0)))
+    about = sim3.adjoint(se3.from_parts(so3.IDENTITY, se3.translation(new.keyframe_poses(held)).mean(0)))
     C = np.diag([lost.rotation_rad**2] * 3 + [0.0] * 3 + [lost.log_scale**2])
     sigma = math.hypot(link.sigma_scale, lost.log_scale)
     carried = replace(

@@ -25,7 +25,7 @@ class PairModel:
             ("covariance_new", pairs.xyz_new, self.centre_new, pairs.covariance_new),
         ):
             distance2 = ((xyz - centre) ** 2).sum(1)
-            setattr(self, name, covariance + half * distance2[:, None, None] * np.eye(3))
+            setattr(self, name, covariance + half * distance2[:, None, None] * so3.IDENTITY)
         self.K_old, self.K_new = old.K, new.K
         self.T_old_kf = old.keyframe_poses(pairs.keyframes)
         self.T_new_kf = new.keyframe_poses(pairs.keyframes)
@@ -66,13 +66,13 @@ class PairModel:
         covariance = self.covariance_old[used] + A @ self.covariance_new[used] @ A.T
         adj, det = symmetric3.adjugate(symmetric3.planes(covariance))
         information = symmetric3.matrices(adj / det)
-        local = np.empty((len(q), 3, 7))
+        local = np.empty((len(q), 3, sim3.DOF))
         local[:, :, :3] = -so3.hat(q)
-        local[:, :, 3:6] = np.eye(3)
+        local[:, :, 3:6] = so3.IDENTITY
         local[:, :, 6] = q
         J = A @ local
-        WJ = (information @ J).reshape(-1, 7)
-        H = J.reshape(-1, 7).T @ WJ
+        WJ = (information @ J).reshape(-1, sim3.DOF)
+        H = J.reshape(-1, sim3.DOF).T @ WJ
         return 0.5 * (H + H.T), WJ.T @ residual.reshape(-1)
 
 

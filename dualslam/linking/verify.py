@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from dualslam.core.config.settings import LinkingConfig
-from dualslam.core.geometry import se3, sim3
+from dualslam.core.geometry import se3, sim3, so3
 from dualslam.core.types import FloatArray, IntArray
 from dualslam.linking.join_test import LinkEvidence, parting_gate, similarity_gates, support_gate
 from dualslam.linking.pairs import PairModel
@@ -45,9 +45,9 @@ def judge_overlap(sigmas: dict[str, float], n_keyframes: int, config: LinkingCon
 
 def sigma_numbers(model: PairModel, S_old_new: FloatArray, covariance: FloatArray) -> dict[str, float]:
     """Return the sigmas of scale (relative), rotation, and position of the overlap's centre (unit of the old map)."""
-    at_centre = sim3.adjoint(se3.from_parts(np.eye(3), -model.centre_new))
+    at_centre = sim3.adjoint(se3.from_parts(so3.IDENTITY, -model.centre_new))
     C = at_centre @ covariance @ at_centre.T
-    distance = np.linalg.norm(model.pairs.xyz_old[:, None] - model.T_old_kf[None, :, :3, 3], axis=2)
+    distance = np.linalg.norm(model.pairs.xyz_old[:, None] - se3.translation(model.T_old_kf)[None], axis=2)
     return {
         "sigma_scale": math.sqrt(C[6, 6]),
         "sigma_rot_deg": math.degrees(math.sqrt(np.linalg.eigvalsh(C[:3, :3])[-1])),

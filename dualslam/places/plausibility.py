@@ -37,7 +37,9 @@ def contradict(atlas: Atlas, one: PlaceMatch, other: PlaceMatch) -> bool:
         return False  # two maps that are not joined may well show one place
     S_world = atlas.S_world_submap(component)
     T_q = atlas.submaps[one.query[0]].T_submap_kf[one.query[1]]
-    centres = [sim3.act_on_pose(S_world[each.place[0]] @ each.S_place_query, T_q)[:3, 3] for each in (one, other)]
+    centres = [
+        se3.translation(sim3.act_on_pose(S_world[each.place[0]] @ each.S_place_query, T_q)) for each in (one, other)
+    ]
     apart = np.linalg.norm(centres[0] - centres[1])
     return bool(apart > float(sim3.scale(S_world[m])) * _depth(atlas, one))
 

@@ -16,6 +16,7 @@ from dualslam.atlas.report import AtlasReport
 from dualslam.core.chi_square import MEDIAN_CHI2
 from dualslam.core.config.settings import Config
 from dualslam.core.events import EventKind
+from dualslam.core.geometry import sim3
 from dualslam.core.interfaces import Seeker, SubmapGraph, VisualOdometry
 from dualslam.core.jobs import Desk, Ended, JobKind
 from dualslam.core.noise_model import MAX_TRIES
@@ -304,7 +305,7 @@ class Revisits:
     def _rest_after(self, report: AtlasReport) -> None:
         """Set when the map is searched again: the later, the less it had drifted."""
         chi2 = report.newest_chi2
-        as_claimed = chi2 is not None and chi2 < MEDIAN_CHI2[7]
+        as_claimed = chi2 is not None and chi2 < MEDIAN_CHI2[sim3.DOF]
         self._rest = min(2 * self._rest, MAX_REST) if as_claimed else REST
         self._rests_until = self._n_asked + self._rest
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
 
-from dualslam.core.geometry import se3, sim3
+from dualslam.core.geometry import se3, sim3, so3
 from dualslam.core.geometry.alignment import estimate_sim3_robust
 from dualslam.core.matchers import PlaceMatcher, Sighting
 from dualslam.core.noise_model import GROUP, MIN_CONSENSUS, SAME_WITHIN, TINY
@@ -124,7 +124,7 @@ def image_spread(submap: Submap, keyframes: tuple[int, ...], landmark_ids: IntAr
 
 def sigmas_at_pairs(xyz_query: FloatArray, S: FloatArray, covariance: FloatArray, place: Side) -> dict[str, float]:
     """Return the sigmas of scale (relative), rotation, and position at the pairs' centre relative to their depth."""
-    at_centre = sim3.adjoint(se3.from_parts(np.eye(3), -np.median(xyz_query, axis=0)))
+    at_centre = sim3.adjoint(se3.from_parts(so3.IDENTITY, -np.median(xyz_query, axis=0)))
     C = at_centre @ covariance @ at_centre.T
     depth = np.median(
         np.linalg.norm(sim3.act(S, xyz_query) - se3.translation(place.submap.T_submap_kf[place.keyframes[0]]), axis=1)

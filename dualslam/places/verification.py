@@ -21,7 +21,7 @@ import numpy as np
 from numpy.random import Generator
 
 from dualslam.core.config.settings import LinkingConfig
-from dualslam.core.geometry import se3, sim3
+from dualslam.core.geometry import se3, sim3, so3
 from dualslam.core.geometry.alignment import Sim3Estimate, estimate_sim3_robust
 from dualslam.core.matchers import PlaceMatcher, Sighting
 from dualslam.core.noise_model import MAJORITY, MIN_CONSENSUS, PROOF_VIEWS
@@ -180,7 +180,7 @@ class PlaceVerifier:
         """Return where landmarks are, and their covariances by their views and the deformation of maps."""
         xyz, half = submap.landmarks["xyz_mu"][ids], 0.5 * self._config.deformation_sigma**2
         spread2 = ((xyz - np.median(xyz, axis=0)) ** 2).sum(1) if len(ids) else np.zeros(0)
-        return xyz, landmark_covariances(submap, ids) + half * spread2[:, None, None] * np.eye(3)
+        return xyz, landmark_covariances(submap, ids) + half * spread2[:, None, None] * so3.IDENTITY
 
     def _estimate(self, pairs: Pairs, rng: Generator) -> Sim3Estimate | Failure:
         config = self._config

@@ -22,7 +22,7 @@ from dualslam.core.noise_model import GATE_SIGMAS, MAJORITY
 from dualslam.core.support import judge_track
 from dualslam.core.types import Failure, FailureReason, FloatArray, Track
 
-JUMP_CHI2 = CHI2_9999[6]
+JUMP_CHI2 = CHI2_9999[se3.DOF]
 """Early sign: squared Mahalanobis distance of a pose from the motion model's, above its level there: chi-square, 6
 degrees of freedom, 99.99 % (what drivers and hands do has heavier tails than a Gaussian). The covariance is that of the
 pose plus the motion model's own error in the last frames."""
@@ -133,7 +133,7 @@ class HealthMonitor:
             signs.append(FailureReason.TOO_FEW_INLIERS)
         if track.n_inliers < MAJORITY * track.n_matches:
             signs.append(FailureReason.LOW_INLIER_RATIO)
-        if jump2 > JUMP_CHI2 * _level(self._jump, CHI2_90[6], TAIL):
+        if jump2 > JUMP_CHI2 * _level(self._jump, CHI2_90[se3.DOF], TAIL):
             signs.append(FailureReason.MOTION_JUMP)
         dof = max(2 * track.n_inliers - 6, 1)
         if track.chi2 > _level(self._chi2, 1.0) * (1 + GATE_SIGMAS * math.sqrt(2 / dof)):

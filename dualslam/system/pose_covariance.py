@@ -50,9 +50,9 @@ class PoseCovariance:
         kf = np.array(sorted(submap.keyframes), np.int64)
         points, ties, information = _without_landmarks(submap, kf)
         if self.frame in submap.keyframes:
-            by_pose = np.zeros((6, 6 * len(kf)))
-            place = 6 * int(np.searchsorted(kf, self.frame))
-            by_pose[:, place : place + 6], own = np.eye(6), np.zeros((6, 6))
+            by_pose = np.zeros((se3.DOF, se3.DOF * len(kf)))
+            place = se3.DOF * int(np.searchsorted(kf, self.frame))
+            by_pose[:, place : place + se3.DOF], own = np.eye(se3.DOF), np.zeros((se3.DOF, se3.DOF))
         else:
             ids, row = np.unique(submap.current_ids(self.landmark_ids), return_index=True)
             known = np.isin(ids, points.ids)
@@ -64,16 +64,17 @@ class PoseCovariance:
             J_pose, J_point = J_pose / sigma, J_point / sigma
             pixels = np.linalg.inv(np.einsum("nij,nik->jk", J_pose, J_pose))
             among = np.searchsorted(points.ids, ids)
-            by_root = np.zeros((6, len(points.ids), 3))
+            by_root = np.zeros((se3.DOF, len(points.ids), 3))
             by_root[:, among] = -np.einsum("ij,nkj,nkl->inl", pixels, J_pose, J_point @ points.root[among])
-            flat = by_root.reshape(6, -1)
+            flat = by_root.reshape(se3.DOF, -1)
             by_pose, own = -(ties @ flat.T).T, pixels + flat @ flat.T
         first, second = _gauge(submap)
         a, b = np.searchsorted(kf, (first, second)).tolist()
         baseline = se3.translation(submap.T_submap_kf[second]) - se3.translation(submap.T_submap_kf[first])
         along = se3.rotation(submap.T_submap_kf[second]).T @ baseline / (baseline @ baseline)
-        information[6 * b + 3 : 6 * b + 6, 6 * b + 3 : 6 * b + 6] += np.outer(along, along) / BASELINE_SIGMA**2
-        free = np.delete(np.arange(6 * len(kf)), np.arange(6 * a, 6 * a + 6))
+        held = slice(se3.DOF * b + 3, se3.DOF * (b + 1))  # the second's translation
+        information[held, held] += np.outer(along, along) / BASELINE_SIGMA**2
+        free = np.delete(np.arange(se3.DOF * len(kf)), np.arange(se3.DOF * a, se3.DOF * (a + 1)))
         try:
             solved = np.linalg.solve(information[np.ix_(free, free)], by_pose[:, free].T)
         except np.linalg.LinAlgError:
@@ -122,9 +123,9 @@ def _without_landmarks(submap: Submap, kf: IntArray) -> tuple[_Points, bsr_array
     n = len(kf)
     tie = J_pose.transpose(0, 2, 1) @ J_point @ root[point]
     ends = np.searchsorted(pose, np.arange(n + 1))
-    ties = bsr_array((tie, point, ends), shape=(6 * n, 3 * len(root)))
-    information = -(ties @ ties.T).toarray() + LOOSE_INFORMATION * np.eye(6 * n)
-    blocks = information.reshape(n, 6, n, 6)
+    ties = bsr_array((tie, point, ends), shape=(se3.DOF * n, 3 * len(root)))
+    information = -(ties @ ties.T).toarray() + LOOSE_INFORMATION * np.eye(se3.DOF * n)
+    blocks = information.reshape(n, se3.DOF, n, se3.DOF)
     blocks[np.arange(n), :, np.arange(n)] += sum_by(pose, J_pose.transpose(0, 2, 1) @ J_pose, n)
     place = {k: i for i, k in enumerate(kf.tolist())}
     for k, known in submap.relative_poses.items():

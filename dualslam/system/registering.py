@@ -205,7 +205,7 @@ class Registering:
             return set()
         taken = set(added)
         own = [p for p in self._state.record.own_poses() if p.submap_id == before.id and p.index not in taken]
-        poses = [FramePose(k, grown.keyframes[k].timestamp_s, grown.id, k, np.eye(4)) for k in added]
+        poses = [FramePose(k, grown.keyframes[k].timestamp_s, grown.id, k, se3.IDENTITY) for k in added]
         path = Path.of([*own, *poses], grown)
         known = ~np.isin(path.index, added)
         sigma = position_sigmas(grown, grown.keyframes.keys() - taken)
@@ -221,7 +221,7 @@ class Registering:
         for k in added:
             keyframe, is_new = submap.keyframes[k], k not in record.poses
             seen = FrameObservations.of(keyframe.features, submap.landmark_of[k], submap.id)
-            n, pose = len(seen.landmark_ids), FramePose(k, keyframe.timestamp_s, submap.id, k, np.eye(4))
+            n, pose = len(seen.landmark_ids), FramePose(k, keyframe.timestamp_s, submap.id, k, se3.IDENTITY)
             record.pose(pose, n, n, seen, FrameMethod.WIDE)
             if is_new:
                 record.rows[k].status = FrameStatus.RECOVERED
@@ -253,5 +253,5 @@ class Registering:
 
 def _scale_between(submap: Submap, other: Submap, a: int, b: int) -> float:
     """Return by how much two keyframes are farther apart in one submap than in another."""
-    here, there = (float(np.linalg.norm(s.T_submap_kf[a][:3, 3] - s.T_submap_kf[b][:3, 3])) for s in (submap, other))
+    here, there = (float(np.linalg.norm(se3.translation(s.T_submap_kf[a] - s.T_submap_kf[b]))) for s in (submap, other))
     return here / max(there, TINY)

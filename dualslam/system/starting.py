@@ -220,7 +220,9 @@ class Starting:
         ids = submap.landmark_of[view.index]
         n = int((ids >= 0).sum())
         T_cam_submap = se3.inverse(submap.T_submap_kf[view.index])
-        return Track(view, T_cam_submap, T_cam_submap, ids, np.zeros(0, np.int64), n, n, 1.0, False, np.zeros((6, 6)))
+        return Track(
+            view, T_cam_submap, T_cam_submap, ids, np.zeros(0, np.int64), n, n, 1.0, False, np.zeros((se3.DOF, se3.DOF))
+        )
 
     def _record_start(self, submap: Submap, start: Start) -> None:
         record = self._state.record

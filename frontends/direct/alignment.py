@@ -70,7 +70,7 @@ def align(
         H = np.einsum("nia,nij,njb->ab", J, M, J, optimize=True)
         g = np.einsum("nia,ni->a", J, m)
         scale = np.sqrt(np.diag(H)) + TINY
-        xi = -np.linalg.solve(H / np.outer(scale, scale) + DAMPING * np.eye(6), g / scale) / scale
+        xi = -np.linalg.solve(H / np.outer(scale, scale) + DAMPING * np.eye(se3.DOF), g / scale) / scale
         T = np.asarray(se3.exp(xi) @ T)
         if np.median(np.linalg.norm(J @ xi, axis=1)) < CONVERGED_PX:
             break

@@ -208,7 +208,7 @@ def turns(before: Pyramid, after: Pyramid, camera: Camera, R_predicted: FloatArr
     K = camera.K / 2.0**level
     by_shift = so3.exp(np.array([-shift_v / K[1, 1], shift_u / K[0, 0], 0.0]))
     found: list[tuple[float, FloatArray]] = []
-    for start in (R_predicted, np.eye(3), by_shift):
+    for start in (R_predicted, so3.IDENTITY, by_shift):
         correlation, R = reference.turn_to(np.asarray(b, np.float32), camera, start, 2.0**level)
         if correlation > 0 and not any(np.linalg.norm(so3.log(R.T @ other)) < SAME_RAD for _, other in found):
             found.append((correlation, R))

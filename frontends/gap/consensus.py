@@ -50,7 +50,7 @@ def confirmed_share(first: BeyondGap, second: BeyondGap, matches: IntArray, K: F
     """
     T_b_a = second.pose.T_cam_submap @ se3.inverse(first.pose.T_cam_submap)
     Ad = se3.adjoint(T_b_a)
-    within = CHI2_99[6] * (second.pose.covariance + Ad @ first.pose.covariance @ Ad.T)
+    within = CHI2_99[se3.DOF] * (second.pose.covariance + Ad @ first.pose.covariance @ Ad.T)
     point_of = np.full(len(first.features), -1)
     point_of[first.rows] = np.arange(len(first.rows))
     rows_a, rows_b = matches.T
@@ -115,9 +115,9 @@ def _static_share(
     def distance(xi: FloatArray) -> FloatArray:
         return sampson_distance(fundamental_from_pose(K, se3.exp(xi) @ T_b_a), uv_a, uv_b)
 
-    J = np.column_stack([(distance(xi) - distance(-xi)) / (2 * STEP) for xi in STEP * np.eye(6)])
+    J = np.column_stack([(distance(xi) - distance(-xi)) / (2 * STEP) for xi in STEP * np.eye(se3.DOF)])
     of_pose = np.einsum("ni,ij,nj->n", J, within, J)
-    agrees = distance(np.zeros(6)) ** 2 < CHI2_95[1] * variance + of_pose
+    agrees = distance(np.zeros(se3.DOF)) ** 2 < CHI2_95[1] * variance + of_pose
     points = triangulate_two_view(uv_a, uv_b, K, se3.IDENTITY, se3.inverse(T_b_a))
     # So far away that an error decides on which side of infinity a point comes to lie, neither side says anything.
     angle2 = CHI2_95[1] * variance / K[0, 0] ** 2 + np.linalg.eigvalsh(se3.rotation(within))[-1]

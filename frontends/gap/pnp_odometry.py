@@ -174,7 +174,7 @@ class PnpOdometry:
         self._note(view, view.index, T_cam_submap)
         self._end_gap()  # not by an ambiguous pose
         n = int((self.submap.landmark_of[view.index] >= 0).sum())
-        return self._live.track_at(view, GivenPose(T_cam_submap, n, n, 1.0, np.zeros((6, 6)), wide=False))
+        return self._live.track_at(view, GivenPose(T_cam_submap, n, n, 1.0, np.zeros((se3.DOF, se3.DOF)), wide=False))
 
     def _end_gap(self) -> None:
         self._following = True

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from dualslam.core.geometry import se3
+from dualslam.core.geometry import se3, so3
 from dualslam.core.geometry.projection import projection_jacobians
 from dualslam.core.noise_model import TINY
 from dualslam.core.types import FloatArray
@@ -32,13 +32,13 @@ def direction_sigma_deg(
     try:
         S = H_cc - np.einsum("nij,njk,nlk->il", H_cp, np.linalg.inv(H_pp), H_cp)
         t_cam = se3.translation(T_b_w)
-        along = np.zeros(6)
+        along = np.zeros(se3.DOF)
         along[3:] = t_cam / np.linalg.norm(t_cam)
         S += np.outer(along, along) * np.trace(H_cc)
         covariance = np.linalg.inv(S)[3:, 3:]
     except np.linalg.LinAlgError:
         return float("inf")
-    across = np.eye(3) - np.outer(along[3:], along[3:])
+    across = so3.IDENTITY - np.outer(along[3:], along[3:])
     variance = float(np.linalg.eigvalsh(across @ covariance @ across)[-1])
     return float(np.degrees(np.sqrt(max(variance, 0.0)) / np.linalg.norm(t_cam)))
 

@@ -17,7 +17,7 @@ from scipy import sparse
 from dualslam.core.arrays import rank_in_runs
 from dualslam.core.chi_square import MEDIAN_CHI2, huber_weights
 from dualslam.core.estimates import ReadoutEstimate
-from dualslam.core.geometry import se3
+from dualslam.core.geometry import se3, so3
 from dualslam.core.geometry.projection import project_points, projection_jacobians
 from dualslam.core.noise_model import DAMPING, MIN_DEPTH_MU, PROOF_VIEWS, ROBUST_K, TINY
 from dualslam.core.types import BoolArray, Failure, FailureReason, FloatArray, IntArray
@@ -142,10 +142,10 @@ def _step(b: ReadoutQuestion) -> float:
     damping = np.where(np.diag(H) > 0, DAMPING * np.diag(H), 1.0)
     S = H - (through @ cross.T).toarray() + np.diag(damping)
     # The first pose is the gauge; the damping holds the scale of the whole, which nothing else does.
-    inverse_S = np.linalg.inv(S[6:, 6:])
-    step = np.concatenate([np.zeros(6), -inverse_S @ (g - through @ g_point)[6:]])
+    inverse_S = np.linalg.inv(S[se3.DOF :, se3.DOF :])
+    step = np.concatenate([np.zeros(se3.DOF), -inverse_S @ (g - through @ g_point)[se3.DOF :]])
     b.xyz = b.xyz - (inverse @ (g_point + cross.T @ step)).reshape(-1, 3)
-    b.T_cam_submap = se3.exp(step[:-1].reshape(-1, 6)) @ b.T_cam_submap
+    b.T_cam_submap = se3.exp(step[:-1].reshape(-1, se3.DOF)) @ b.T_cam_submap
     b.readout_s += float(step[-1])
     return float(np.sqrt(max(inverse_S[-1, -1], 0.0)))
 
@@ -155,14 +155,14 @@ def _jacobians(b: ReadoutQuestion, front: BoolArray, root_weight: FloatArray) ->
     N).
     """
     n = len(b.kf)
-    J, J_point = np.zeros((n, 2, 7)), np.zeros((n, 2, 3))
+    J, J_point = np.zeros((n, 2, se3.DOF + 1)), np.zeros((n, 2, 3))
     for f, T in enumerate(b.T_cam_submap):
         rows = np.flatnonzero((b.kf == f) & front)
-        J[rows, :, :6], J_point[rows] = projection_jacobians(b.K, T, b.xyz[b.point[rows]])
-    J[:, :, 6] = b.by_readout
+        J[rows, :, : se3.DOF], J_point[rows] = projection_jacobians(b.K, T, b.xyz[b.point[rows]])
+    J[:, :, -1] = b.by_readout
     w = (root_weight / b.sigma_px)[:, None, None]
-    column = np.column_stack([6 * b.kf[:, None] + np.arange(6), np.full(n, 6 * len(b.T_cam_submap))])
-    shapes = (2 * n, 6 * len(b.T_cam_submap) + 1), (2 * n, 3 * len(b.xyz))
+    column = np.column_stack([se3.DOF * b.kf[:, None] + np.arange(se3.DOF), np.full(n, se3.DOF * len(b.T_cam_submap))])
+    shapes = (2 * n, se3.DOF * len(b.T_cam_submap) + 1), (2 * n, 3 * len(b.xyz))
     columns = column, 3 * b.point[:, None] + np.arange(3)
     by_all, by_point = (
         sparse.csr_array(
@@ -181,5 +181,5 @@ def _inverse_blocks(J_point: Any) -> Any:
     blocks = np.zeros((n, 3, 3))
     blocks[np.repeat(np.arange(n), np.diff(H.indptr))] = H.data
     damping = DAMPING / 3 * np.trace(blocks, axis1=1, axis2=2) + TINY
-    inverse = np.linalg.inv(blocks + damping[:, None, None] * np.eye(3))
+    inverse = np.linalg.inv(blocks + damping[:, None, None] * so3.IDENTITY)
     return sparse.bsr_array((inverse, np.arange(n), np.arange(n + 1))).tocsr()

@@ -15,6 +15,8 @@ from numpy.typing import ArrayLike
 from dualslam.core.geometry import so3
 from dualslam.core.types import FloatArray
 
+DOF = 6
+"""Numbers that a small motion has."""
 IDENTITY = np.eye(4)
 IDENTITY.setflags(write=False)
 

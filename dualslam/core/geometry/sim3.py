@@ -13,6 +13,8 @@ from numpy.typing import ArrayLike
 from dualslam.core.geometry import se3, so3
 from dualslam.core.types import FloatArray
 
+DOF = 7
+"""Numbers that a small similarity has."""
 # The integrals over the one-parameter subgroup are entire functions: Gauss-Legendre gives them to machine precision for
 # every angle up to pi and scales within e^+-10, without the singular cases that the closed forms have.
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(20)

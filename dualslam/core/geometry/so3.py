@@ -14,6 +14,8 @@ from numpy.typing import ArrayLike
 
 from dualslam.core.types import FloatArray
 
+IDENTITY = np.eye(3)
+IDENTITY.setflags(write=False)
 SERIES_BELOW_RAD2 = 1.0
 """Squared angle under which coefficients with cancellation are summed as series (error then below 1e-16)."""
 N_TERMS = 12

@@ -209,7 +209,7 @@ def _same_gauge(live: Submap, base: Submap) -> bool:
     first, second = base.gauge
     if live.gauge != base.gauge or not {first, second} <= live.keyframes.keys():
         return False
-    baselines = [m.T_submap_kf[second][:3, 3] - m.T_submap_kf[first][:3, 3] for m in (live, base)]
+    baselines = [se3.translation(m.T_submap_kf[second] - m.T_submap_kf[first]) for m in (live, base)]
     lengths = [float(np.linalg.norm(each)) for each in baselines]
     stays = np.allclose(live.T_submap_kf[first], base.T_submap_kf[first], rtol=0, atol=SAME_GAUGE)
     return bool(stays) and abs(lengths[0] - lengths[1]) <= SAME_GAUGE * lengths[1]

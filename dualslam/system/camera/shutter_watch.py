@@ -22,7 +22,7 @@ from dualslam.core.camera.base import Camera
 from dualslam.core.errors import SolverError
 from dualslam.core.estimates import ReadoutEstimate
 from dualslam.core.events import EventKind
-from dualslam.core.geometry import so3
+from dualslam.core.geometry import se3, so3
 from dualslam.core.interfaces import Shutter, VisualOdometry
 from dualslam.core.jobs import JobKind
 from dualslam.core.noise_model import GATE_SIGMAS, INFLATION
@@ -71,13 +71,13 @@ def with_turn_of_poses(
     gap_s = view.timestamp_s - before.timestamp_s
     if not 0 < abs(gap_s) <= MAX_GAP_S:
         return track
-    turn_rad = shutter.readout_s * _rate(_orientation(submap, before), track.T_cam_submap[:3, :3].T, gap_s)
+    turn_rad = shutter.readout_s * _rate(_orientation(submap, before), se3.rotation(track.T_cam_submap).T, gap_s)
     features = shutter.moved(view.features, camera, turn_rad - view.turn_rad)
     return replace(track, view=replace(view, features=features, turn_rad=turn_rad))
 
 
 def _orientation(submap: Submap, pose: FramePose) -> FloatArray:
-    return submap.resolve_anchor(pose.keyframe_id, pose.T_kf_cam)[:3, :3]
+    return se3.rotation(submap.resolve_anchor(pose.keyframe_id, pose.T_kf_cam))
 
 
 def _rate(R_before: FloatArray, R_after: FloatArray, gap_s: FloatArray | float) -> FloatArray:
