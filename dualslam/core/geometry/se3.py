@@ -7,6 +7,7 @@ Robotics", 2017, chapter 7, reordered (Barfoot puts translation first).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from math import factorial
 
 import numpy as np
@@ -36,6 +37,11 @@ def from_parts(R: ArrayLike, t: ArrayLike) -> FloatArray:
     T[..., :3, 3] = translation
     T[..., 3, 3] = 1.0
     return T
+
+
+def stack(poses: Sequence[FloatArray]) -> FloatArray:
+    """Return (N, 4, 4) of N poses, or none."""
+    return np.asarray(poses, np.float64).reshape(-1, 4, 4)
 
 
 def rotation(T: FloatArray) -> FloatArray:
@@ -129,17 +135,8 @@ def _Q(xi: FloatArray) -> FloatArray:
     return np.asarray(out, np.float64)
 
 
-def left_jacobian(xi: ArrayLike) -> FloatArray:
-    """Return J with ``exp(xi + d) ~= exp(J d) exp(xi)``, (..., 6) -> (..., 6, 6). Barfoot, eq. (7.85)."""
-    x = np.asarray(xi, np.float64)
-    J = np.zeros((*x.shape, 6))
-    J[..., :3, :3] = J[..., 3:, 3:] = so3.left_jacobian(x[..., :3])
-    J[..., 3:, :3] = _Q(x)
-    return J
-
-
 def left_jacobian_inverse(xi: ArrayLike) -> FloatArray:
-    """Return the inverse of `left_jacobian`. Barfoot, eq. (7.95)."""
+    """Return the inverse of J with ``exp(xi + d) ~= exp(J d) exp(xi)``, (..., 6, 6). Barfoot, eq. (7.95)."""
     x = np.asarray(xi, np.float64)
     J = np.zeros((*x.shape, 6))
     inv = so3.left_jacobian_inverse(x[..., :3])
@@ -151,9 +148,3 @@ def left_jacobian_inverse(xi: ArrayLike) -> FloatArray:
 def right_jacobian_inverse(xi: ArrayLike) -> FloatArray:
     """Return the inverse of the right Jacobian, ``J_l(-xi)``."""
     return left_jacobian_inverse(-np.asarray(xi, np.float64))
-
-
-def normalise(T: ArrayLike) -> FloatArray:
-    """Return the pose with its rotation made orthonormal again, (..., 4, 4)."""
-    pose = np.asarray(T, np.float64)
-    return from_parts(so3.orthonormalise(pose[..., :3, :3]), pose[..., :3, 3])

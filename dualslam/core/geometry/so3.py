@@ -89,24 +89,6 @@ def log(R: ArrayLike) -> FloatArray:
     return v * factor[..., None]
 
 
-def inverse(R: ArrayLike) -> FloatArray:
-    """Return the transpose, (..., 3, 3)."""
-    return np.swapaxes(np.asarray(R, np.float64), -1, -2)
-
-
-def act(R: ArrayLike, p: ArrayLike) -> FloatArray:
-    """Rotate one point (3,) or N points (..., N, 3) by R (..., 3, 3)."""
-    rotation, points = np.asarray(R, np.float64), np.asarray(p, np.float64)
-    if points.ndim == 1:
-        return rotation @ points
-    return points @ np.swapaxes(rotation, -1, -2)
-
-
-def adjoint(R: ArrayLike) -> FloatArray:
-    """Return the adjoint, which for SO(3) is the matrix itself: ``R exp(w) R' == exp(adjoint(R) w)``."""
-    return np.array(R, np.float64)
-
-
 def left_jacobian(omega: ArrayLike) -> FloatArray:
     """Return J with ``exp(w + d) ~= exp(J d) exp(w)``, (..., 3) -> (..., 3, 3). Barfoot, eq. (7.77)."""
     w = np.asarray(omega, np.float64)
