@@ -181,17 +181,14 @@ def submap_from_arrays(arrays: Arrays) -> Submap:
 
     Raises `KeyError`, `ValueError` if an array is missing or of another shape.
     """
-    version = int(arrays["format"])
-    if version not in (SUBMAP_FORMAT - 1, SUBMAP_FORMAT):
-        raise ValueError(f"format {version} where {SUBMAP_FORMAT} is due")
-    if version < SUBMAP_FORMAT:
-        arrays = {**arrays, "landmarks_condemned": np.zeros(len(arrays["landmarks_alive"]), bool)}
+    if int(arrays["format"]) != SUBMAP_FORMAT:
+        raise ValueError(f"format {int(arrays['format'])} where {SUBMAP_FORMAT} is due")
     check_submap(arrays)
     landmarks, observations = _group(arrays, "landmarks_"), _group(arrays, "observations_")
     descriptors = landmarks["descriptor"]
     submap = Submap(int(arrays["id"]), arrays["K"], np.zeros(descriptors.shape[1:], descriptors.dtype))
     submap.gauge = (int(arrays["gauge"][0]), int(arrays["gauge"][1]))
-    submap.condemned = set(arrays["condemned"].tolist()) if version == SUBMAP_FORMAT else set()
+    submap.condemned = set(arrays["condemned"].tolist())
     ends = np.cumsum(arrays["kf_n_features"]).tolist()
     features = _group(arrays, "features_")
     rows = zip([0, *ends[:-1]], ends, arrays["kf_id"].tolist(), arrays["kf_timestamp_s"].tolist(), strict=False)

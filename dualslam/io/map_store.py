@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dualslam.atlas.atlas import Atlas, Link, LinkKind, joined, rollover_covariance
+from dualslam.atlas.atlas import Atlas, Link, LinkKind, joined
 from dualslam.atlas.stored_map import StoredMap
 from dualslam.atlas.trajectory import FramePose
 from dualslam.atlas.warp import Warp
@@ -103,8 +102,7 @@ def load_atlas(folder: str | Path) -> StoredMap:
         atlas = Atlas()
         for name in sorted(groups.keys() - set(_OTHER)):
             atlas.add(submap_from_arrays(groups[name]))
-        _join(atlas, atlas.submaps, groups[LINKS], groups.get(SOLUTION), metadata)
-        atlas.links = [_not_exact(link, atlas) for link in atlas.links]
+        _join(atlas, atlas.submaps, groups[LINKS], groups[SOLUTION], metadata)
         frames = groups[FRAMES]
         check_rows(frames, FRAME_ROWS)
         columns = (frames[name].tolist() for name in ("index", "timestamp_s", "submap", "keyframe"))
@@ -142,9 +140,8 @@ def load_placement(folder: Path, submap_ids: Iterable[int | None]) -> tuple[list
     files, metadata = read_index(folder)
     with _naming_damage(folder):
         ids = sorted(int(name.removeprefix(SUBMAP)) for name in files if name not in _OTHER)
-        solution = load_arrays(files[SOLUTION]) if SOLUTION in files else None
         atlas = Atlas()
-        _join(atlas, ids, load_arrays(files[LINKS]), solution, metadata)
+        _join(atlas, ids, load_arrays(files[LINKS]), load_arrays(files[SOLUTION]), metadata)
         component = next((c for c in joined(ids, atlas.believed) if asked in c), [])
         return component, atlas.S_world_submap(component) if component else {}
 
@@ -162,17 +159,13 @@ def _solution_arrays(atlas: Atlas) -> dict[str, NDArray[Any]]:
     }
 
 
-def _join(
-    atlas: Atlas, ids: Collection[int], links: Arrays, solution: Arrays | None, metadata: Mapping[str, Any]
-) -> None:
-    """Fill in how the submaps of an atlas are joined; `solution` is None for a map of an earlier version."""
+def _join(atlas: Atlas, ids: Collection[int], links: Arrays, solution: Arrays, metadata: Mapping[str, Any]) -> None:
+    """Fill in how the submaps of an atlas are joined."""
     check_rows(links, LINK_ROWS)
     for link in _links(links, metadata):
         if not {link.a, link.b} <= set(ids):
             raise ValueError(f"a link joins the submaps {link.a} and {link.b}, of which one is not there")
         atlas.link(link)
-    if solution is None:
-        return
     check_rows(solution, PLACED_ROWS, WARP_ROWS, HELD_ROWS)
     atlas.placement = dict(zip(solution["placed"].tolist(), solution["S_world_submap"], strict=True))
     for m in np.unique(solution["warp"][:, 0]).tolist():
@@ -185,21 +178,13 @@ def _join(
 def _links(arrays: Arrays, metadata: Mapping[str, Any]) -> list[Link]:
     ab, S_a_b, covariance = arrays["ab"].tolist(), arrays["S_a_b"], arrays["covariance"]
     kinds = [LinkKind(kind) for kind in metadata["link_kinds"]]
-    ends = arrays["keyframes_ab"].tolist() if "keyframes_ab" in arrays else [(-1, -1)] * len(ab)
-    rejected = arrays["rejected"].tolist() if "rejected" in arrays else [False] * len(ab)
+    ends, rejected = arrays["keyframes_ab"].tolist(), arrays["rejected"].tolist()
     is_sure = arrays["is_sure"].tolist() if "is_sure" in arrays else [C[6, 6] <= _EARLIER_SURE**2 for C in covariance]
     rows = zip(ab, S_a_b, covariance, kinds, metadata["link_keyframes"], ends, rejected, is_sure, strict=True)
     links = []
     for (a, b), S, C, kind, shared, (k_a, k_b), refused, sure in rows:
         links.append(Link(a, b, S, C, kind, tuple(map(int, shared)), k_a, k_b, refused, sure))
     return links
-
-
-def _not_exact(link: Link, atlas: Atlas) -> Link:
-    """Return a rollover's link with the current stiffness. An earlier version took it as exact."""
-    if link.kind is not LinkKind.ROLLOVER or link.covariance.any():
-        return link
-    return replace(link, covariance=rollover_covariance(atlas.submaps[link.b], link.attached(atlas)[1]))
 
 
 def _check_frames(frames: Arrays, atlas: Atlas) -> None:
