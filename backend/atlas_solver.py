@@ -152,11 +152,11 @@ class _Graph:
         for i, e in enumerate(edges):
             L = np.linalg.cholesky(e.covariance)
             share = np.eye(sim3.DOF) - np.linalg.solve(L, np.linalg.solve(L, P[i]).T)
-            values, vectors = np.linalg.eigh(0.5 * (share + share.T))
+            values, vectors = np.linalg.eigh((share + share.T) / 2)
             back = vectors / np.maximum(values, LEAST_REDUNDANCY) @ vectors.T
             C[i] = L @ back @ L.T
             r[i] = L @ back @ np.linalg.solve(L, r[i])
-        return 0.5 * (C + C.transpose(0, 2, 1)), r
+        return (C + C.transpose(0, 2, 1)) / 2, r
 
 
 def _root(parent: list[int], i: int) -> int:

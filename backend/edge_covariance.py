@@ -94,12 +94,12 @@ def _covariance(
     read = np.zeros((sim3.DOF, size))
     read[: se3.DOF, se3.DOF * b : se3.DOF * b + se3.DOF] = np.eye(se3.DOF)
     read[-1] = units[1]
-    system = 0.5 * (system + system.T)[np.ix_(free, free)]
+    system = (system + system.T)[np.ix_(free, free)] / 2
     try:
         found = read[:, free] @ np.linalg.solve(system, read[:, free].T)
     except np.linalg.LinAlgError as error:
         raise SolverError(f"no covariance between keyframes {first} and {second} of submap {submap.id}") from error
-    return np.asarray(0.5 * (found + found.T), np.float64)
+    return np.asarray((found + found.T) / 2, np.float64)
 
 
 def _linearise(

@@ -10,6 +10,7 @@ import numpy as np
 from dualslam.backend.observability import compute_depth_sigmas, compute_residuals, numbered, take_mask
 from dualslam.backend.selection import Candidates, choose_factors
 from dualslam.core.config.settings import GraphConfig
+from dualslam.core.geometry import se3
 from dualslam.core.noise_model import COVISIBLE, MAX_DEPTH_SIGMA, MIN_DEPTH_MU, MIN_LANDMARKS, PROOF_VIEWS
 from dualslam.core.types import BoolArray, FloatArray, IntArray
 from dualslam.map.submap import Submap
@@ -247,7 +248,7 @@ class FactorIndex:
     ) -> tuple[BoolArray, BoolArray]:
         """Return which of the rows fit, and which landmarks are certain enough (`trusted` ones are not asked)."""
         ids, pose = numbered(submap.observations["kf"][row])
-        T = np.array([poses[k] for k in ids.tolist()]).reshape(-1, 4, 4)
+        T = se3.stack([poses[k] for k in ids.tolist()])
         point = submap.observations["landmark"][row]
         sigma = self.rows["sigma_px"][row]
         res = compute_residuals(

@@ -9,6 +9,7 @@ import numpy as np
 
 from dualslam.backend.factor_index import FactorIndex
 from dualslam.backend.observability import numbered, take_mask
+from dualslam.core.geometry import se3
 from dualslam.core.types import BoolArray, FloatArray, IntArray
 from dualslam.map.submap import Submap
 
@@ -81,4 +82,4 @@ def views_of(submap: Submap, ids: IntArray, inside: IntArray, poses: Mapping[int
     row = row[obs["alive"][row]]
     keyframes, pose = numbered(obs["kf"][row])
     T = [poses[k] if k in poses else submap.T_submap_kf[k] for k in keyframes.tolist()]
-    return Views(row, np.array(T).reshape(-1, 4, 4), pose, np.searchsorted(ids, obs["landmark"][row]))
+    return Views(row, se3.stack(T), pose, np.searchsorted(ids, obs["landmark"][row]))

@@ -101,7 +101,7 @@ class _Reduced:
 def geman_mcclure(chi2: FloatArray, shape: float) -> tuple[FloatArray, FloatArray]:
     """Return weights and losses: far beyond `shape` sigmas a residual no longer counts."""
     share = shape**2 / (shape**2 + chi2)
-    return share**2, 0.5 * chi2 * share
+    return share**2, chi2 / 2 * share
 
 
 def optimise(
@@ -179,7 +179,7 @@ class System:
 
     def cost(self, state: State) -> float:
         """Return the sum of the losses, and the prior's."""
-        prior = 0.0 if self._lens is None else 0.5 * float(state.lens @ self._lens.information @ state.lens)
+        prior = 0.0 if self._lens is None else float(state.lens @ self._lens.information @ state.lens) / 2
         return prior + sum(float(losses.sum()) for *_, losses in self._fits(state))
 
     def _fits(self, state: State) -> Iterable[_Fit]:

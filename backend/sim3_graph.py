@@ -17,7 +17,7 @@ from dualslam.backend.noise import GAUGE_SIGMA, gaussian
 from dualslam.backend.observability import find_components
 from dualslam.backend.solver import GTSAM_ERRORS, SolverFailure
 from dualslam.core.errors import SolverError
-from dualslam.core.geometry import sim3
+from dualslam.core.geometry import se3, sim3
 from dualslam.core.types import FloatArray, IntArray
 
 
@@ -66,13 +66,13 @@ class Sim3Solution:
                 found[i] = J @ C @ J.T
         except GTSAM_ERRORS as error:
             raise SolverError(f"no covariances between {len(pairs)} pairs of Sim(3) nodes: {error}") from error
-        return 0.5 * (found + found.transpose(0, 2, 1))
+        return (found + found.transpose(0, 2, 1)) / 2
 
     def residuals(self, edges: Sequence[Sim3Edge]) -> FloatArray:
         """Return (E, 7): how far the nodes stand off each edge, in the edge's own tangent space."""
         S = [sim3.inverse(self.S_world_node[e.first]) @ self.S_world_node[e.second] for e in edges]
-        measured = np.array([e.S_first_second for e in edges]).reshape(-1, 4, 4)
-        return sim3.log(sim3.inverse(measured) @ np.array(S).reshape(-1, 4, 4))
+        measured = se3.stack([e.S_first_second for e in edges])
+        return sim3.log(sim3.inverse(measured) @ se3.stack(S))
 
 
 def optimise_sim3(

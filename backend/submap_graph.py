@@ -39,6 +39,7 @@ from dualslam.backend.ties import TieChanges, Ties, insert_projections
 from dualslam.core.config.settings import GraphConfig
 from dualslam.core.errors import SolverError
 from dualslam.core.estimates import GraphEstimate
+from dualslam.core.geometry import se3
 from dualslam.core.types import FloatArray, IntArray
 from dualslam.map.submap import Submap
 
@@ -230,7 +231,7 @@ class ISam2SubmapGraph:
             graph, obs["kf"][e], obs["landmark"][e], rows["uv_px"][e], rows["sigma_px"][e], K, self._noise
         )
         new = plan.new_keyframes
-        convert.insert_poses(values, new, np.array([poses[k] for k in new.tolist()]).reshape(-1, 4, 4))
+        convert.insert_poses(values, new, se3.stack([poses[k] for k in new.tolist()]))
         convert.insert_points(values, plan.new_landmarks, xyz_mu[plan.new_landmarks])
         return _Changes(graph, values, remove + ties.remove, ties, order)
 
@@ -353,7 +354,7 @@ class ISam2SubmapGraph:
             if attempt >= REBUILD_ATTEMPTS // 2:
                 self._ties.forced.update(submap.keyframes)
             try:
-                caution = 1.0 + 0.5 * attempt
+                caution = 1.0 + attempt / 2
                 plan, optimum = self._seed(submap, iterations or self._rebuild_iterations, caution, with_all)
                 return self._read(submap, start, plan, True, rebuilt, optimum if with_all else None)
             except SolverFailure as failure:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from dualslam.core.config.settings import Config
 from dualslam.core.resources import peak_rss_mb
 from dualslam.core.types import Features, Keyframe
-from dualslam.frontends.features.hamming import hamming_distance
+from dualslam.frontends.features.orb import hamming_distance
 from dualslam.frontends.registry import create_frontend
 from dualslam.lab.synthetic import make_sequence
 from dualslam.map.submap import Submap

@@ -19,8 +19,15 @@ __version__ = "0.1.0"
 
 if TYPE_CHECKING:
     from dualslam.backend.measurements.base import Mount
-    from dualslam.backend.measurements.kinds import Direction, Distance, Height, Position, RelativePose, SamePlace
-    from dualslam.backend.measurements.rotation_rate import RotationRate
+    from dualslam.backend.measurements.kinds import (
+        Direction,
+        Distance,
+        Height,
+        Position,
+        RelativePose,
+        RotationRate,
+        SamePlace,
+    )
     from dualslam.build import build_system, create_frontend, recovery_parts
     from dualslam.core.camera.base import Camera
     from dualslam.core.config.files import config_from_dict, dump_config, load_config
@@ -46,8 +53,7 @@ if TYPE_CHECKING:
 
 _NAMES = {
     "backend.measurements.base": "Mount",
-    "backend.measurements.kinds": "Direction Distance Height Position RelativePose SamePlace",
-    "backend.measurements.rotation_rate": "RotationRate",
+    "backend.measurements.kinds": "Direction Distance Height Position RelativePose RotationRate SamePlace",
     "build": "build_system create_frontend recovery_parts",
     "core.camera.base": "Camera",
     "core.config.files": "config_from_dict dump_config load_config",

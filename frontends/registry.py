@@ -14,8 +14,7 @@ from pydantic import BaseModel, ValidationError
 
 from dualslam.core.config.problems import nearest_of
 from dualslam.core.config.settings import FrontendConfig, PixelsConfig
-from dualslam.core.errors import ConfigError, written
-from dualslam.core.extras import how_to_install
+from dualslam.core.errors import ConfigError, how_to_install, written
 from dualslam.core.interfaces import Frontend, PixelMatcher
 
 ENTRY_POINT_GROUP = "dualslam.frontends"
@@ -52,6 +51,8 @@ FOR_MAPS = (*FOR_WALKS, "distance", "scale_factor", "n_octaves", "max_distance",
 
 NAME = ("frontend", "name")
 """Field of the config: what a mistake is about."""
+N_FEATURES = 1500
+"""Of a front end that is made without a configuration."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -211,7 +212,7 @@ class OptionedFrontend:
     name: str
     options_model: ClassVar[type[BaseModel]]  # of its options
 
-    def __init__(self, n_features: int = 1500, options: Any = None) -> None:
+    def __init__(self, n_features: int = N_FEATURES, options: Any = None) -> None:
         self.n_features = n_features
         self.options = options or self.options_model()
 

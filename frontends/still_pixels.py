@@ -236,7 +236,7 @@ class StillPixels:
     def _camera_moves(self) -> bool:
         """Whether a camera that stood moves again: most of what stood still has moved; all votes are forgotten then."""
         n_left = np.count_nonzero(self._found & self._stood)
-        if n_left > 0.5 * np.count_nonzero(self._stood):
+        if n_left > np.count_nonzero(self._stood) / 2:
             return False
         self._votes = np.minimum(self._votes, 0)
         self._found = np.zeros_like(self._found)

@@ -316,7 +316,7 @@ class JointGraph:
             noise = gtsam.noiseModel.Diagonal.Sigmas(sigmas)
             graph.push_back(gtsam.PriorFactorSimilarity3(node, convert.to_similarity3(S), noise))
         for source, key in self._clock.items():
-            noise = gtsam.noiseModel.Isotropic.Sigma(1, 0.5 * MAX_OFFSET_S)
+            noise = gtsam.noiseModel.Isotropic.Sigma(1, MAX_OFFSET_S / 2)
             graph.push_back(gtsam.PriorFactorVector(key, np.array([-self.offsets_s[source]]), noise))
         for kind, key in self._shared.items():
             sigmas = next(np.asarray(t.reading.shared_sigmas) for t in self.terms if t.reading.kind == kind)
@@ -474,4 +474,4 @@ def _largest_sigma(C: FloatArray) -> float:
 def _small_motion(xi: FloatArray) -> FloatArray:
     """Return the pose of a short motion, to second order: `se3.exp` would be half of all the time."""
     W = so3.hat(xi[:3])
-    return se3.from_parts(np.eye(len(W)) + W + 0.5 * W @ W, xi[3:] + 0.5 * W @ xi[3:])
+    return se3.from_parts(np.eye(len(W)) + W + W / 2 @ W, xi[3:] + W / 2 @ xi[3:])

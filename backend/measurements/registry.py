@@ -23,7 +23,7 @@ _OURS = "dualslam.backend.measurements"
 BUILT_IN: Mapping[str, str] = {
     "position": f"{_OURS}.kinds:Position",
     "relative_pose": f"{_OURS}.kinds:RelativePose",
-    "rotation_rate": f"{_OURS}.rotation_rate:RotationRate",
+    "rotation_rate": f"{_OURS}.kinds:RotationRate",
     "direction": f"{_OURS}.kinds:Direction",
     "height": f"{_OURS}.kinds:Height",
     "distance": f"{_OURS}.kinds:Distance",

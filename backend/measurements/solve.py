@@ -10,7 +10,7 @@ import numpy as np
 
 from dualslam.backend.measurements.base import Mount
 from dualslam.backend.measurements.joint_graph import DRIFTS, MAX_RUN, JointGraph
-from dualslam.backend.measurements.rotation_rate import RotationRate
+from dualslam.backend.measurements.kinds import RotationRate
 from dualslam.backend.measurements.start import MAX_OFFSET_S, POSITION, QUANTILE_99
 from dualslam.backend.solver import GTSAM_ERRORS, SolverFailure
 from dualslam.core.errors import InputError, SolverError

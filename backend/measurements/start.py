@@ -125,7 +125,7 @@ def _align(c: FloatArray, p: FloatArray, sigma: float, up: FloatArray | None) ->
     for _ in range(N_ROUNDS):
         w = (1.0 + (r / max(float(np.median(r)), TINY)) ** 2) ** -2
         w /= w.sum()
-        scale = np.sqrt((w @ (p - w @ p) ** 2).sum() / max(float((w @ (c - w @ c) ** 2).sum()), 1e-24))
+        scale = np.sqrt((w @ (p - w @ p) ** 2).sum() / max(float((w @ (c - w @ c) ** 2).sum()), TINY**2))
         for above in (np.array([0.0, -1.0, 0.0]) if up is None else up, np.array([1.0, 0.0, 0.0])):
             raised = np.concatenate((c, c + above * sigma / scale)), np.concatenate((p, p + [0.0, 0.0, sigma]))
             fit = umeyama(*raised, np.tile(w, 2))

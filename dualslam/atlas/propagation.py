@@ -112,7 +112,7 @@ def rows_of_frames(record: Record, submap: Submap, at_most: int, min_inliers: in
     rows = [row for row in rows if len(row[1]) >= min_inliers]
     n_seen = np.array([len(ids) for _, ids, _, _ in rows], np.int64)
     return FrameRows(
-        np.array([submap.resolve_anchor(p.keyframe_id, p.T_kf_cam) for p, *_ in rows]).reshape(-1, 4, 4),
+        se3.stack([submap.resolve_anchor(p.keyframe_id, p.T_kf_cam) for p, *_ in rows]),
         np.repeat(np.arange(len(rows)), n_seen),
         np.concatenate([np.zeros(0, np.int64), *(ids for _, ids, _, _ in rows)]),
         np.concatenate([np.zeros((0, 2)), *(uv_px for _, _, uv_px, _ in rows)]),

@@ -239,7 +239,7 @@ def _across(
     S_ka_kb = sim3.inverse(T_a) @ np.array([link.S_a_b for link in links]) @ T_b
     Ad = sim3.adjoint(sim3.inverse(T_b))
     C = Ad @ np.array([link.covariance for link in links]) @ Ad.transpose(0, 2, 1)
-    C = 0.5 * (C + C.transpose(0, 2, 1))
+    C = (C + C.transpose(0, 2, 1)) / 2
     return AtlasEdges(
         np.array([row[a] for a, _ in ends], np.int64),
         np.array([row[b] for _, b in ends], np.int64),

@@ -46,7 +46,7 @@ class Path:
         times_s = np.array([pose.timestamp_s for pose in by_index], np.float64)
         T = [submap.resolve_anchor(pose.keyframe_id, pose.T_kf_cam) for pose in by_index]
         index = np.array([pose.index for pose in by_index], np.int64)
-        return cls.of_trajectory(Trajectory(times_s, np.array(T, np.float64).reshape(-1, 4, 4), index))
+        return cls.of_trajectory(Trajectory(times_s, se3.stack(T), index))
 
     @classmethod
     def of_trajectory(cls, trajectory: Trajectory) -> Path:

@@ -23,9 +23,9 @@ from dualslam.core.types import Failure, FloatArray, Frame
 from dualslam.frontends.choice import Candidate, choose_frontend
 from dualslam.frontends.features.images import features_of
 from dualslam.frontends.frame_reader import view_of
-from dualslam.frontends.place_matcher import FrontendPlaceMatcher
 from dualslam.frontends.registry import create_frontend
 from dualslam.frontends.tracking.initialiser import Initialiser
+from dualslam.frontends.tracking.local_map import look
 from dualslam.map.lens import Calibration
 from dualslam.map.submap import Submap
 from dualslam.places import FaissRecogniser, PlaceVerifier
@@ -48,10 +48,9 @@ def new_initialiser(config: Config, frontend: Frontend, size_px: tuple[int, int]
 
 def place_parts(config: Config, frontend: Frontend, camera: Camera) -> PlaceParts:
     """Build what recognises places and verifies them; `camera`: as it was given."""
-    matcher = FrontendPlaceMatcher(frontend, camera)
     return PlaceParts(
         FaissRecogniser(frontend.distance, frontend.max_distance_strict),
-        PlaceVerifier(matcher, config.linking, config.seed),
+        PlaceVerifier(frontend, partial(look, frontend, camera), config.linking, config.seed),
     )
 
 

@@ -51,7 +51,7 @@ from dualslam.map.graph_beside import BesideGraphs
 from dualslam.map.lens import Calibration
 from dualslam.map.submap import Submap
 from dualslam.map.submap_change import open_graph
-from dualslam.places.resemblance import find_resembling
+from dualslam.places.faiss_index import find_resembling
 from dualslam.recovery.registration import MIN_PARALLAX_DEG
 from dualslam.system.state import Components
 from dualslam.system.system import System

@@ -1,31 +1,32 @@
-"""`dualslam bench`: every sequence in every condition with every variant, and the tables of the paper from it."""
+"""`dualslam bench`: every sequence in every condition with every variant, and the paper's tables and figures of it."""
 
 from __future__ import annotations
 
 import argparse
+import logging
 import os
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Sequence
 from functools import partial
+from importlib.util import find_spec
 from pathlib import Path
 
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
 from dualslam.cli import logs
-from dualslam.cli.bench_figures import draw_figures
-from dualslam.core.errors import InputError
+from dualslam.core.errors import InputError, how_to_install
 from dualslam.lab.bench.cluster import run_on_cluster
 from dualslam.lab.bench.plan import plan_trials
 from dualslam.lab.bench.pool import run_in_processes
 from dualslam.lab.bench.record import TrialRecord, judge
 from dualslam.lab.bench.run import Executor, run_bench
 from dualslam.lab.bench.spec import BenchSpec, Half, load_spec
+from dualslam.lab.bench.table import ResultTable
 from dualslam.lab.bench.tables import bench_tables
 from dualslam.lab.bench.verdict_tables import verdict_tables
 from dualslam.lab.bench.write_tables import TABLES, write_tables
 from dualslam.run.bench_trial import describe_source, run_trial
+
+log = logging.getLogger(__name__)
+FOLDER = "figures"
 
 
 def execute(args: argparse.Namespace) -> int:
@@ -36,8 +37,9 @@ def execute(args: argparse.Namespace) -> int:
     trials = plan_trials(spec, partial(describe_source, data=args.data))
     out: Path = args.out if args.out is not None else Path("runs") / _folder_name(spec)
     logs.release()
-    with _progress(spec, args.quiet) as on_trial:
-        records = run_bench(spec, trials, out, _executor(args, out), on_trial, args.limit)
+    records = run_bench(
+        spec, trials, out, _executor(args, out), None if args.quiet else partial(_say, spec), args.limit
+    )
     tables = verdict_tables(spec, records) + bench_tables(spec, records)
     written = write_tables(spec, tables, records, out, command=_command(args))
     written += draw_figures(spec, tables, records, out)
@@ -71,21 +73,61 @@ def _command(args: argparse.Namespace) -> str:
     return " ".join(words)
 
 
-@contextmanager
-def _progress(spec: BenchSpec, quiet: bool) -> Iterator[Callable[[TrialRecord, int, int], None] | None]:
-    """Show a bar on stderr if a person watches; a line for each trial if not."""
-    if quiet:
-        yield None
-        return
-    if not sys.stderr.isatty():
-        yield lambda record, n_done, n: print(f"{n_done}/{n} {_line(spec, record)}", file=sys.stderr, flush=True)
-        return
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task(spec.name, total=None)
-        yield lambda record, n_done, n: bar.update(task, completed=n_done, total=n, description=_line(spec, record))
-
-
-def _line(spec: BenchSpec, record: TrialRecord) -> str:
+def _say(spec: BenchSpec, record: TrialRecord, n_done: int, n: int) -> None:
+    """Write a line for a trial that is done."""
     failed = judge(record, spec.thresholds)
-    return f"{record.key}: {'good' if failed is None else failed}, coverage {100 * record.coverage:.0f} %"
+    outcome = f"{'good' if failed is None else failed}, coverage {100 * record.coverage:.0f} %"
+    print(f"{n_done}/{n} {record.key}: {outcome}", file=sys.stderr, flush=True)
+
+
+def draw_figures(
+    spec: BenchSpec, tables: Sequence[ResultTable], records: Sequence[TrialRecord], out: Path
+) -> list[Path]:
+    """Draw the figures into ``figures/``; return what was written: nothing without matplotlib, and the log says so."""
+    if find_spec("matplotlib") is None:
+        log.warning("no figures: they need matplotlib (%s)", how_to_install("report"))
+        return []
+    from dualslam.report.bench_figures import draw_delays, draw_end_points, draw_rates, draw_statuses
+
+    folder = out / FOLDER
+    files = [folder / "table_2_failures.png", folder / "figure_6_initialisation.png"]
+    draw_rates(files[0], _rates(tables))
+    by_variant = {v: [r for r in records if r.variant == v] for v in spec.variant_names}
+    draw_delays(files[1], {v: [r.initialised_after_s for r in trials] for v, trials in by_variant.items()})
+    tried = {r.sequence for r in records}  # conditions may leave a sequence out
+    sequences = [s for s in spec.sequences if s.name in tried]
+    for sequence in sequences:
+        files.append(folder / f"figure_7_{sequence.name}.png")
+        draw_statuses(files[-1], sequence.name, _statuses(spec, records, sequence.name))
+    returning = [s.name for s in sequences if s.returns_to_start]
+    if returning:
+        files.append(folder / "figure_9_end_point.png")
+        errors = {v: {s: _errors(spec, trials, s) for s in returning} for v, trials in by_variant.items()}
+        draw_end_points(files[-1], errors)
+    return [file.with_suffix(ending) for file in files for ending in (".png", ".pdf")]
+
+
+def _rates(tables: Sequence[ResultTable]) -> dict[str, dict[str, tuple[float, float, float]]]:
+    """Return percent and the ends of the interval."""
+    table = next(t for t in tables if t.name == "table_2_failures")
+    rates: dict[str, dict[str, tuple[float, float, float]]] = {}
+    for row in table.rows:
+        cells = dict(zip(table.columns, row, strict=True))
+        percent, low, high = (float(cells[name] or 0) for name in ("rate %", "rate low %", "rate high %"))
+        rates.setdefault(str(cells["which trials"]), {})[str(cells["variant"])] = percent, low, high
+    return rates
+
+
+def _statuses(spec: BenchSpec, records: Sequence[TrialRecord], sequence: str) -> dict[str, dict[str, list[str]]]:
+    here = [r for r in records if r.sequence == sequence]
+    return {
+        condition: {
+            v: [r.status for r in here if (r.condition, r.variant) == (condition, v)] for v in spec.variant_names
+        }
+        for condition in dict.fromkeys(r.condition for r in here)
+    }
+
+
+def _errors(spec: BenchSpec, trials: Sequence[TrialRecord], sequence: str) -> list[float | None]:
+    here = [r for r in trials if r.sequence == sequence]
+    return [None if judge(r, spec.thresholds) is not None else r.end_point_error_m for r in here]

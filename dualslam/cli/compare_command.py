@@ -6,7 +6,7 @@ import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
-from dualslam.cli.early import check_free
+from dualslam.cli.configuration import check_free
 from dualslam.io.atomic import write_text
 from dualslam.report import RunData, comparison_page, comparison_table, read_run
 

@@ -1,4 +1,4 @@
-"""From the options of the command line to one configuration."""
+"""From the options of the command line to one configuration; a mistyped field or path is answered at once."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Any
 from dualslam.core.config import strict_yaml
 from dualslam.core.config.files import Override, load_config, load_run_config
 from dualslam.core.config.settings import Config
-from dualslam.core.errors import ConfigError, InputError
+from dualslam.core.errors import ConfigError, InputError, OutputError, check_exists
 from dualslam.core.schedule import SCHEDULE, Recorded
 
 
@@ -88,3 +88,28 @@ def _read_corruptions(path: Path) -> list[Any]:
             f"--corrupt {path}: corruptions are a list, such as - {{kind: blackout, start: 100, length: 10}}"
         )
     return items
+
+
+def check(args: argparse.Namespace) -> None:
+    """Refuse a configuration that names what does not exist, and a source that is not there.
+
+    Raises `ConfigError`, `InputError`.
+    """
+    if hasattr(args, "set"):
+        config_of(args)
+    for source in getattr(args, "sources", ()):
+        # A number is a webcam; with a colon it is a stream or a synthetic world.
+        if ":" not in source and not source.isdigit():
+            check_exists(Path(source))
+
+
+def check_free(file: Path, overwrite: bool, instead: str) -> None:
+    """Refuse a file that is there already, unless it may be replaced.
+
+    - `overwrite`: whether `--overwrite` was given.
+    - `instead`: what to name in its place, and by which option: "another with --out".
+
+    Raises `OutputError`.
+    """
+    if file.exists() and not overwrite:
+        raise OutputError(f"{file} is there already; name {instead}, or give --overwrite.")

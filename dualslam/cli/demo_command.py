@@ -10,9 +10,8 @@ from typing import Any
 from dualslam.build import check_config
 from dualslam.cli import logs
 from dualslam.cli.compare_command import present
-from dualslam.cli.configuration import config_of, naming_source
+from dualslam.cli.configuration import check_free, config_of, naming_source
 from dualslam.cli.console import progress
-from dualslam.cli.early import check_free
 from dualslam.cli.run_command import conclude, naming_frontend
 from dualslam.core.errors import InputError
 from dualslam.core.types import Frame

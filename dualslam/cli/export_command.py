@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dualslam.atlas.stored_map import StoredMap
-from dualslam.cli.early import check_free
+from dualslam.cli.configuration import check_free
 from dualslam.cli.view_command import save_recording
 from dualslam.core.errors import DualSlamError, InputError, OutputError
 from dualslam.core.geometry import se3

@@ -118,7 +118,7 @@ def _late(name: str) -> Callable[[argparse.Namespace], int]:
 
     def execute(args: argparse.Namespace) -> int:
         with held_back():
-            early = import_module("dualslam.cli.early")
+            early = import_module("dualslam.cli.configuration")
         early.check(args)
         with held_back():
             command = import_module(f"dualslam.cli.{name}_command")

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable
 from pathlib import Path
 
+_ROOT = Path(__file__).resolve().parents[2]
+
 
 class DualSlamError(Exception):
     """Base of every error that dualslam raises on purpose. Its message says what was wrong, where, and what to do."""
@@ -65,3 +67,10 @@ def check_exists(source: Path) -> None:
             f"{source} does not exist; give a sequence folder, a video file, the number of a webcam or the "
             "address of a stream."
         )
+
+
+def how_to_install(extra: str) -> str:
+    """Return the command that installs an extra: of this checkout, or of the installed wheel."""
+    if (_ROOT / "pyproject.toml").is_file():
+        return f'pip install -e "{_ROOT}[{extra}]"'
+    return f'pip install "dualslam[{extra}]"'

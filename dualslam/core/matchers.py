@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dualslam.core.types import Features, FloatArray, IntArray, Matches
+from dualslam.core.types import Features, FloatArray, IntArray
 
 if TYPE_CHECKING:
     from dualslam.map.submap import Submap
@@ -70,31 +71,6 @@ class Sighting:
         return float(np.median(found[counts] / n[counts])) if counts.any() else 0.0
 
 
-class PlaceMatcher(Protocol):
-    """Compares places; made of a front end by `dualslam.build`."""
-
-    max_distance: float
-    max_distance_strict: float
-
-    def distance(self, a: NDArray[np.generic], b: NDArray[np.generic]) -> FloatArray:
-        """Distance of paired descriptors."""
-        ...
-
-    def match_wide(self, a: Features, b: Features) -> Matches:
-        """Match without a geometric guide, one to one."""
-        ...
-
-    def look(
-        self,
-        submap: Submap,
-        landmark_ids: IntArray,
-        T_cam_submap: FloatArray,
-        K: FloatArray,
-        features: Features,
-        radius_px: float,
-    ) -> Sighting:
-        """Look for landmarks of a submap in an image, about where they should be under a pose.
-
-        `K`: (3, 3) intrinsics of the image; `radius_px`: at the finest octave.
-        """
-        ...
+Look = Callable[["Submap", IntArray, FloatArray, FloatArray, Features, float], Sighting]
+"""Looks for landmarks of a submap in an image, about where they should be: their ids, the pose ``T_cam_submap``, the
+image's intrinsics (3, 3), its features, and the radius in pixels at the finest octave."""

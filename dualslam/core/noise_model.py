@@ -57,3 +57,5 @@ UNSURE_SCALE = 0.1
 probability above 5 %. What is off by so much is too large or too small to be measured in."""
 TINY = 1e-12
 """A divisor in place of zero."""
+LEAST = 1e-300
+"""A divisor in place of zero, where even the smallest numbers count."""

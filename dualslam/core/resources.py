@@ -1,11 +1,14 @@
-"""Threads and memory of a process, for the numerical libraries that it loads. Numpy is not imported here."""
+"""Threads, memory and signals of a process. Numpy is not imported here."""
 
 from __future__ import annotations
 
 import ctypes
 import os
 import resource
+import signal
 import sys
+from multiprocessing import resource_tracker
+from multiprocessing.process import BaseProcess
 
 LIMITS = {
     "OMP_NUM_THREADS": "1",
@@ -64,3 +67,22 @@ def peak_rss_mb(with_children: bool = False) -> float:
     whose = (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN) if with_children else (resource.RUSAGE_SELF,)
     peak = sum(resource.getrusage(who).ru_maxrss for who in whose)
     return peak / MB if sys.platform == "darwin" else peak / 2**10
+
+
+def start_undisturbed(process: BaseProcess) -> None:
+    """Start a spawned process in which SIGINT is held back from its first instruction on.
+
+    An interrupt at the terminal reaches all processes of a run, and the first one's decides. A process that only
+    ignored it in its own code would die with a stack trace while it still imports.
+    """
+    resource_tracker.ensure_running()  # starting a process would do that, and lets signals through again
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        process.start()
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def hear_interrupts() -> None:
+    """Let SIGINT through, in a process of `start_undisturbed`; one that came before comes now."""
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})

@@ -20,8 +20,7 @@ from pathlib import Path
 from tempfile import mkdtemp
 from typing import Any
 
-from dualslam.core.errors import InputError
-from dualslam.core.extras import how_to_install
+from dualslam.core.errors import InputError, how_to_install
 
 ROS1_MAGIC, MCAP_MAGIC, SQLITE_MAGIC = b"#ROSBAG V2.0\n", b"\x89MCAP0\r\n", b"SQLite format 3\0"
 ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from dualslam.core.camera.focal import ToldFocal
 from dualslam.core.errors import InputError
-from dualslam.io import exif
+from dualslam.io import file_metadata
 from dualslam.io.decoding import UnreadableImageError, decode, file_values, used_bits
 
 log = logging.getLogger(__name__)
@@ -141,8 +141,8 @@ class ImageFiles:
 
     def told_focal(self) -> ToldFocal | None:
         """Return what the EXIF data of the first image tell."""
-        ratio = exif.focal_over_longer_side(self.paths[0])
-        return None if ratio is None else ToldFocal(ratio, exif.SIGMA)
+        ratio = file_metadata.focal_over_longer_side(self.paths[0])
+        return None if ratio is None else ToldFocal(ratio, file_metadata.SIGMA)
 
 
 class ZippedImages:

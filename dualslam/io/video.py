@@ -21,9 +21,8 @@ from dualslam.core.camera.models import camera_from_fov
 from dualslam.core.errors import InputError
 from dualslam.core.types import FloatArray, Frame
 from dualslam.io.camera_build import make_camera
-from dualslam.io.container import edited_s, equivalent_focal_mm
 from dualslam.io.decoding import UnreadableImageError
-from dualslam.io.exif import is_likely, over_longer_side
+from dualslam.io.file_metadata import edited_s, equivalent_focal_mm, is_likely, over_longer_side
 from dualslam.io.images import ImageReader
 from dualslam.io.read_ahead import read_ahead
 from dualslam.io.sequence import Recording, Selection, camera_of_size

@@ -29,7 +29,6 @@ from dualslam.linking.correspondences import (
     match_landmarks,
     place_pairs,
 )
-from dualslam.linking.deformation import deformation_covariance, measure_deformation
 from dualslam.linking.join_test import (
     LOOK_BACK,
     MAX_HYPOTHESES,
@@ -43,8 +42,10 @@ from dualslam.linking.pairs import PairModel
 from dualslam.linking.timeline import (
     KeyframeVotes,
     ask_keyframes,
+    deformation_covariance,
     find_discontinuities,
     leading_run,
+    measure_deformation,
     smallest_share_handed_on,
 )
 from dualslam.map.submap import Submap

@@ -24,7 +24,7 @@ import numpy as np
 from dualslam.core.config.settings import LinkingConfig
 from dualslam.core.estimates import PreferredCamera
 from dualslam.core.geometry import se3, sim3, so3
-from dualslam.core.noise_model import GROUP
+from dualslam.core.noise_model import GROUP, LEAST
 from dualslam.core.types import Failure, FailureReason, FloatArray, IntArray
 from dualslam.linking.estimate import LinkEstimate, LinkRefusal
 from dualslam.linking.join_test import JoinGate, LinkEvidence, live_scale_gate
@@ -121,7 +121,7 @@ def _places(ids: IntArray, agreeing: IntArray, live_since: int) -> tuple[IntArra
 
 def _log_spread(T: FloatArray, rows: IntArray) -> float:
     centres = T[rows, :3, 3]
-    return 0.5 * math.log(max(float(((centres - centres.mean(axis=0)) ** 2).sum()), 1e-300))
+    return math.log(max(float(((centres - centres.mean(axis=0)) ** 2).sum()), LEAST)) / 2
 
 
 def _mean_turn(T_now: FloatArray, T_other: FloatArray) -> FloatArray:

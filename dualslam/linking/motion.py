@@ -18,7 +18,7 @@ import numpy as np
 
 from dualslam.atlas.trajectory import Path
 from dualslam.core.geometry import sim3
-from dualslam.core.noise_model import GATE_SIGMAS, MISSING_INTERVALS
+from dualslam.core.noise_model import GATE_SIGMAS, LEAST, MISSING_INTERVALS
 from dualslam.core.types import BoolArray, FloatArray, IntArray
 
 WINDOW_S = 0.3
@@ -193,7 +193,7 @@ def _measure(fits: _Fits, last_before: int, known: _Fits, slack_mu: float = 0.0)
     velocities, may_halt = (fits.before.velocity[i], fits.after.velocity[j]), 1.0
     if all(has):
         difference, mean = (float(np.linalg.norm(velocities[0] + sign * velocities[1])) for sign in (-1.0, 1.0))
-        may_halt = min(1.0, difference / max(mean, 1e-300))
+        may_halt = min(1.0, difference / max(mean, LEAST))
     usual, n_asked, asked_s = _usual_error(known, apart_s, *weights)
     # A camera that goes on at the speed that it had has hardly stood still: it may rather be at a similar place.
     off = fits.error_of_a_halt(i, j, *weights, may_halt * (apart_s - asked_s))
@@ -204,11 +204,11 @@ def _measure(fits: _Fits, last_before: int, known: _Fits, slack_mu: float = 0.0)
 def _explained(off: FloatArray, before: FloatArray, after: FloatArray, over_s: float) -> tuple[float, float]:
     """Return how far a change of velocity displaces a camera at most, and the part of an error that it leaves."""
     change = after - before
-    along = change / max(float(np.linalg.norm(change)), 1e-300)
-    speeds, mean = (float(np.linalg.norm(v)) for v in (before, after)), 0.5 * (before + after)
-    further = (0.5 * sum(speeds) - float(np.linalg.norm(mean))) * over_s
+    along = change / max(float(np.linalg.norm(change)), LEAST)
+    speeds, mean = (float(np.linalg.norm(v)) for v in (before, after)), (before + after) / 2
+    further = (sum(speeds) / 2 - float(np.linalg.norm(mean))) * over_s
     across = float(np.linalg.norm(off - (off @ along) * along))
-    return 0.5 * float(np.linalg.norm(change)) * over_s, max(across - further, 0.0)
+    return float(np.linalg.norm(change)) / 2 * over_s, max(across - further, 0.0)
 
 
 def _usual_error(known: _Fits, apart_s: float, of_before: float, of_after: float) -> tuple[float, int, float]:
@@ -221,7 +221,7 @@ def _usual_error(known: _Fits, apart_s: float, of_before: float, of_after: float
         return 0.0, 0, 0.0
     span_s = float(known.times_s[-1] - known.times_s[0])
     asked_s, n_asked = min(apart_s, span_s / INDEPENDENT), 0
-    while asked_s > 0.5 * known.usual_s:
+    while asked_s > known.usual_s / 2:
         i, j = known.stretches(asked_s, of_before > 0, of_after > 0)
         n_asked = max(n_asked, len(i))
         if len(i) >= MIN_ASKED:
@@ -255,7 +255,7 @@ class _Fits:
     def of(cls, path: Path) -> _Fits:
         t = path.times_s - path.times_s[0] if len(path) else path.times_s
         usual_s = float(np.median(np.diff(t))) if len(t) > 1 else 0.0
-        reach_s = max(WINDOW_S, WINDOW_FRAMES * usual_s) + 0.5 * usual_s
+        reach_s = max(WINDOW_S, WINDOW_FRAMES * usual_s) + usual_s / 2
         rows = np.arange(len(t))
         first, end = np.searchsorted(t, t - reach_s, "right"), np.searchsorted(t, t + reach_s, "left")
         before, after = (_fit(t, path.centres, a, b, usual_s) for a, b in ((first, rows + 1), (rows, end)))
@@ -277,13 +277,13 @@ class _Fits:
         apart_s = float(self.times_s[j] - self.times_s[i])
         velocity = of_before * self.before.velocity[i] + of_after * self.after.velocity[j]
         moved = self.after.place[j] - self.before.place[i]
-        moving_s = float(moved @ velocity) / max(float(velocity @ velocity), 1e-300)
+        moving_s = float(moved @ velocity) / max(float(velocity @ velocity), LEAST)
         return np.asarray(moved - velocity * np.clip(moving_s, apart_s - halt_s, apart_s), np.float64)
 
     def stretches(self, apart_s: float, needs_before: bool, needs_after: bool) -> tuple[IntArray, IntArray]:
         """Return the pairs of frames so far apart in time over which the camera was tracked without a jump."""
         t = self.times_s
-        j = np.searchsorted(t, t + apart_s - 0.5 * self.usual_s)
+        j = np.searchsorted(t, t + apart_s - self.usual_s / 2)
         i = np.flatnonzero(j < len(t))
         j = j[i]
         jumps = np.concatenate([[0], np.cumsum(self.jumped)])

@@ -19,7 +19,7 @@ class PairModel:
     def __init__(self, pairs: Correspondences, old: Submap, new: Submap, deformation_sigma: float) -> None:
         self.pairs = pairs
         self.centre_old, self.centre_new = np.median(pairs.xyz_old, axis=0), np.median(pairs.xyz_new, axis=0)
-        half = 0.5 * deformation_sigma**2
+        half = deformation_sigma**2 / 2
         for name, xyz, centre, covariance in (
             ("covariance_old", pairs.xyz_old, self.centre_old, pairs.covariance_old),
             ("covariance_new", pairs.xyz_new, self.centre_new, pairs.covariance_new),
@@ -73,7 +73,7 @@ class PairModel:
         J = A @ local
         WJ = (information @ J).reshape(-1, sim3.DOF)
         H = J.reshape(-1, sim3.DOF).T @ WJ
-        return 0.5 * (H + H.T), WJ.T @ residual.reshape(-1)
+        return (H + H.T) / 2, WJ.T @ residual.reshape(-1)
 
 
 def pixel_chi2(

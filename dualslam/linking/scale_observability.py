@@ -238,7 +238,7 @@ def _linearise(question: ScaleQuestion) -> _Problem | None:
     reduced = -np.asarray((through @ H_cross.T).toarray())
     for f in range(n_f):
         reduced[6 * f : 6 * f + 6, 6 * f : 6 * f + 6] += H_pose[f]
-    return _Problem(ids, T, q.xyz[points], kf, point, inverse, H_cross, 0.5 * (reduced + reduced.T))
+    return _Problem(ids, T, q.xyz[points], kf, point, inverse, H_cross, (reduced + reduced.T) / 2)
 
 
 def _scale_at(problem: _Problem, ids: IntArray) -> tuple[FloatArray, FloatArray] | None:

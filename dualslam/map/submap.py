@@ -144,7 +144,7 @@ class Submap:
 
     def keyframe_poses(self, keyframe_ids: IntArray | list[int]) -> FloatArray:
         """Return (K, 4, 4) poses, camera to submap."""
-        return np.array([self.T_submap_kf[int(k)] for k in keyframe_ids]).reshape(-1, 4, 4)
+        return se3.stack([self.T_submap_kf[int(k)] for k in keyframe_ids])
 
     def keyframes_near(self, index: int) -> list[int]:
         """Return all keyframes by their distance in time from frame `index`, the nearest first (ties: lower id)."""
@@ -405,7 +405,7 @@ class Submap:
                 self.T_submap_kf[k] = np.array(T)
         lm["xyz_mu"][landmark_ids] = xyz_mu
         after = xyz_mu - self._centres(first)[at]
-        growth2 = np.einsum("ij,ij->i", after, after) / np.maximum(np.einsum("ij,ij->i", before, before), 1e-24)
+        growth2 = np.einsum("ij,ij->i", after, after) / np.maximum(np.einsum("ij,ij->i", before, before), TINY**2)
         lm["distance_mu"][landmark_ids] *= np.where(np.isfinite(growth2), np.sqrt(growth2), 1.0)
 
     def _centres(self, keyframe_ids: IntArray) -> FloatArray:

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from dualslam.core.geometry import se3, sim3, so3
 from dualslam.core.geometry.alignment import estimate_sim3_robust
-from dualslam.core.matchers import PlaceMatcher, Sighting
+from dualslam.core.interfaces import Frontend
+from dualslam.core.matchers import Sighting
 from dualslam.core.noise_model import GROUP, MIN_CONSENSUS, SAME_WITHIN, TINY
 from dualslam.core.types import BoolArray, Failure, FloatArray, IntArray
 from dualslam.map.submap import Submap
@@ -151,7 +152,7 @@ class SecondSimilarity:
     first_support: int
 
 
-def alike(a: NDArray[np.generic], b: NDArray[np.generic], matcher: PlaceMatcher) -> tuple[IntArray, IntArray]:
+def alike(a: NDArray[np.generic], b: NDArray[np.generic], frontend: Frontend) -> tuple[IntArray, IntArray]:
     """Return all pairs of rows that look alike: for each of a the `N_ALIKE` nearest of b that are near enough.
 
     `a`, `b` (N, D), (M, D): descriptors.
@@ -159,10 +160,10 @@ def alike(a: NDArray[np.generic], b: NDArray[np.generic], matcher: PlaceMatcher)
     if not len(a) or not len(b):
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
     rows, columns = (index.ravel() for index in np.indices((len(a), len(b))))
-    distance = np.asarray(matcher.distance(a[rows], b[columns])).reshape(len(a), len(b))
+    distance = np.asarray(frontend.distance(a[rows], b[columns])).reshape(len(a), len(b))
     n = min(N_ALIKE, len(b))
     nearest = np.argsort(distance, axis=1, kind="stable")[:, :n]
-    near = np.take_along_axis(distance, nearest, axis=1) <= matcher.max_distance_strict
+    near = np.take_along_axis(distance, nearest, axis=1) <= frontend.max_distance_strict
     i, column = np.nonzero(near)
     return i, nearest[i, column]
 

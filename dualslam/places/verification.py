@@ -23,7 +23,8 @@ from numpy.random import Generator
 from dualslam.core.config.settings import LinkingConfig
 from dualslam.core.geometry import se3, sim3, so3
 from dualslam.core.geometry.alignment import Sim3Estimate, estimate_sim3_robust
-from dualslam.core.matchers import PlaceMatcher, Sighting
+from dualslam.core.interfaces import Frontend
+from dualslam.core.matchers import Look, Sighting
 from dualslam.core.noise_model import MAJORITY, MIN_CONSENSUS, PROOF_VIEWS
 from dualslam.core.types import Failure, FailureReason, Features, FloatArray, IntArray
 from dualslam.linking.join_test import (
@@ -94,8 +95,8 @@ class PlaceVerifier:
     - `seed`: the random choices depend on it and on the two keyframes alone, not on what was asked before.
     """
 
-    def __init__(self, matcher: PlaceMatcher, config: LinkingConfig, seed: int) -> None:
-        self._matcher = matcher
+    def __init__(self, frontend: Frontend, look: Look, config: LinkingConfig, seed: int) -> None:
+        self._frontend, self._look_for = frontend, look
         self._config = config
         self._seed = seed
 
@@ -132,7 +133,7 @@ class PlaceVerifier:
         - `features`: of the frame.
         """
         place = side_of(submap, keyframe_id)
-        look = self._matcher.look(submap, place.landmarks, T_cam_submap, submap.K, features, SEARCH_RADIUS_PX)
+        look = self._look_for(submap, place.landmarks, T_cam_submap, submap.K, features, SEARCH_RADIUS_PX)
         own = self._own_found(place)
         numbers = {"own_found": own, "n_visible": float(len(look.feature))}
         return LinkEvidence.of([_found_gate(look.share, own)]).refusal(numbers)
@@ -168,7 +169,7 @@ class PlaceVerifier:
         a, b = np.flatnonzero(place.landmark_of[k] >= 0), np.flatnonzero(query.landmark_of[q] >= 0)
         if not len(a) or not len(b):
             return np.zeros(0, np.int64), np.zeros(0, np.int64)
-        found = self._matcher.match_wide(place.keyframes[k].features.take(a), query.keyframes[q].features.take(b))
+        found = self._frontend.match_wide(place.keyframes[k].features.take(a), query.keyframes[q].features.take(b))
         return place.landmark_of[k][a[found.index[:, 0]]], query.landmark_of[q][b[found.index[:, 1]]]
 
     def _place_pairs(self, place: Submap, query: Submap, in_place: IntArray, in_query: IntArray) -> Pairs:
@@ -178,7 +179,7 @@ class PlaceVerifier:
 
     def _points(self, submap: Submap, ids: IntArray) -> tuple[FloatArray, FloatArray]:
         """Return where landmarks are, and their covariances by their views and the deformation of maps."""
-        xyz, half = submap.landmarks["xyz_mu"][ids], 0.5 * self._config.deformation_sigma**2
+        xyz, half = submap.landmarks["xyz_mu"][ids], self._config.deformation_sigma**2 / 2
         spread2 = ((xyz - np.median(xyz, axis=0)) ** 2).sum(1) if len(ids) else np.zeros(0)
         return xyz, landmark_covariances(submap, ids) + half * spread2[:, None, None] * so3.IDENTITY
 
@@ -214,7 +215,7 @@ class PlaceVerifier:
     def _look(self, seen: Side, looking: Submap, keyframe_id: int, S_seen_looking: FloatArray) -> Sighting:
         T_seen_cam = sim3.act_on_pose(S_seen_looking, looking.T_submap_kf[keyframe_id])
         features = looking.keyframes[keyframe_id].features
-        return self._matcher.look(
+        return self._look_for(
             seen.submap, seen.landmarks, se3.inverse(T_seen_cam), looking.K, features, SEARCH_RADIUS_PX
         )
 
@@ -284,7 +285,7 @@ class PlaceVerifier:
         """Look for another similarity among all similar landmarks, in the place and in the query keyframe."""
         asked = np.unique(query.submap.seen_in(query.keyframes[0]))
         theirs, ours = query.submap.landmarks["descriptor"], place.submap.landmarks["descriptor"]
-        i, j = alike(theirs[asked], ours[place.landmarks], self._matcher)
+        i, j = alike(theirs[asked], ours[place.landmarks], self._frontend)
         xyz_query, cov_query = self._points(query.submap, asked)
         xyz_place, cov_place = self._points(place.submap, place.landmarks)
         all_pairs = Pairs(place.landmarks[j], asked[i], xyz_place[j], xyz_query[i], cov_place[j], cov_query[i]).fixed()

@@ -13,13 +13,12 @@ from dualslam.io.run_folder import EVENTS, MAP_PAGE, MASK
 from dualslam.report.charts import beside_table, latency_histogram, pace_words, stage_table
 from dualslam.report.failures import failures_section, stories, verdict
 from dualslam.report.markup import Markup, cards, document, duration, join, number, picture, table, tag
-from dualslam.report.next_steps import camera_words, next_steps
 from dualslam.report.places import places_section
 from dualslam.report.run_data import RunData, read_run
 from dualslam.report.statuses import WITHOUT_POSE, count, event_words, seen_again
 from dualslam.report.timeline import timeline
 from dualslam.report.top_view import top_view
-from dualslam.report.trust import trust_section
+from dualslam.report.trust import camera_words, next_steps, trust_section
 
 MAX_EVENTS = 500
 """A bound on the size of the page."""

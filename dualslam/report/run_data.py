@@ -12,8 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dualslam.core.config import strict_yaml
-from dualslam.core.errors import InputError
-from dualslam.core.extras import how_to_install
+from dualslam.core.errors import InputError, how_to_install
 from dualslam.core.geometry import sim3
 from dualslam.core.types import BoolArray, FloatArray, FrameStatus, IntArray
 from dualslam.io import run_folder

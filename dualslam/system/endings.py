@@ -19,8 +19,7 @@ from dualslam.map.submap import Submap
 from dualslam.places.sightings import Sightings
 from dualslam.recovery.fusion import drop_corrupted
 from dualslam.recovery.manager import Recoveries
-from dualslam.recovery.scale_parts import part_what_lost_its_scale
-from dualslam.recovery.scale_watch import ScaleLoss, ScaleWatch
+from dualslam.recovery.scale_watch import ScaleLoss, ScaleWatch, part_what_lost_its_scale
 from dualslam.system.health import count_signs
 from dualslam.system.state import State
 

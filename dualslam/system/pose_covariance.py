@@ -80,7 +80,7 @@ class PoseCovariance:
         except np.linalg.LinAlgError:
             return None
         covariance = by_pose[:, free] @ solved + own
-        return np.asarray(0.5 * (covariance + covariance.T))
+        return np.asarray((covariance + covariance.T) / 2)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

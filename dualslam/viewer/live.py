@@ -15,9 +15,8 @@ from collections.abc import Callable
 from multiprocessing.connection import Connection
 from typing import TYPE_CHECKING
 
-from dualslam.core.errors import InputError, OutputError
-from dualslam.core.extras import how_to_install
-from dualslam.core.processes import start_undisturbed
+from dualslam.core.errors import InputError, OutputError, how_to_install
+from dualslam.core.resources import start_undisturbed
 from dualslam.core.types import Frame
 from dualslam.core.walk_news import WalkNews
 from dualslam.map.frame_records import FrameResult

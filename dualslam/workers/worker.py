@@ -14,8 +14,7 @@ from threading import Event, Thread
 from typing import Any
 
 from dualslam.core.jobs import Handlers, JobKind, Limit, result_of
-from dualslam.core.processes import start_undisturbed
-from dualslam.core.resources import keep_freed_memory, peak_rss_mb
+from dualslam.core.resources import keep_freed_memory, peak_rss_mb, start_undisturbed
 from dualslam.core.types import Failure, FailureReason
 from dualslam.workers.transport import Channel
 

@@ -117,7 +117,7 @@ class Patches:
             usable = inside(self.uv_px, axes, HALF, self.references[0][0].shape[::-1])
             usable &= greys.std(axis=(1, 2)) >= MIN_CONTRAST
             du, dv = greys[:, 1:-1, 2:] - greys[:, 1:-1, :-2], greys[:, 2:, 1:-1] - greys[:, :-2, 1:-1]
-            gradient = 0.5 * np.stack([du, dv], axis=-1).reshape(len(self), -1, 2).astype(np.float64)
+            gradient = np.stack([du, dv], axis=-1).reshape(len(self), -1, 2).astype(np.float64) / 2
             self._kept[level, smear] = Templates(greys, gradient, usable)
         return self._kept[level, smear]
 

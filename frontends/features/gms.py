@@ -7,6 +7,7 @@ from pydantic import Field
 from dualslam.core.types import Features, Matches
 from dualslam.frontends.features.motion_statistics import THRESHOLD, match_by_motion
 from dualslam.frontends.features.orb import OrbFrontend, OrbOptions
+from dualslam.frontends.registry import N_FEATURES
 
 
 class GmsOptions(OrbOptions):
@@ -27,7 +28,7 @@ class GmsFrontend(OrbFrontend):
     options: GmsOptions
     options_model = GmsOptions
 
-    def __init__(self, n_features: int = 1500, options: GmsOptions | None = None) -> None:
+    def __init__(self, n_features: int = N_FEATURES, options: GmsOptions | None = None) -> None:
         super().__init__(n_features, options)
         # The cells about a cell are where they are expected to within half a cell: at a distance of one cell, a turn by
         # 30 degrees or a zoom by 1.5. A step of 45 degrees leaves 22.5, a step of 1.41 in size 1.2.

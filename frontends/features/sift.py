@@ -18,7 +18,7 @@ from dualslam.core.types import BoolArray, Features, FloatArray, IntArray, Match
 from dualslam.frontends.features.corners import grades, select_spread, share_out
 from dualslam.frontends.features.groups import consistent_rotation, mutual_best
 from dualslam.frontends.features.images import to_grey
-from dualslam.frontends.registry import OptionedFrontend
+from dualslam.frontends.registry import N_FEATURES, OptionedFrontend
 
 DESCRIPTOR_LENGTH = 128
 UNIT = 512
@@ -69,7 +69,7 @@ class SiftFrontend(OptionedFrontend):
     max_turn_deg = 180.0
     max_zoom = 2.0
 
-    def __init__(self, n_features: int = 1500, options: SiftOptions | None = None) -> None:
+    def __init__(self, n_features: int = N_FEATURES, options: SiftOptions | None = None) -> None:
         super().__init__(n_features, options)
         self.scale_factor = float(2.0 ** (1.0 / self.options.levels_per_doubling))
         self.n_octaves = self.options.n_octaves

@@ -112,7 +112,7 @@ class AuxiliaryMap:
             visible[:, v] = row >= 0
             uv[visible[:, v], v] = self._features[index].uv_rect_px[row[row >= 0]]
             sigma[visible[:, v], v] = self._features[index].sigma_px[row[row >= 0]]
-        T = np.array([self.T_cam_submap(index) for index in frames]).reshape(-1, 4, 4)
+        T = se3.stack([self.T_cam_submap(index) for index in frames])
         return TrackViews(T, uv, sigma, visible)
 
     def _extend(self, other: int, index: int, pairs: IntArray) -> None:

@@ -93,7 +93,7 @@ def are_no_copies(
     rays = np.column_stack([(uv_first - K[:2, 2]) / (K[0, 0], K[1, 1]), np.ones(len(matches))])
     shown, _ = project_points(K, T_second @ se3.inverse(T_first), rays * float(np.median(depth)))
     apart_px = np.linalg.norm(second.features.uv_rect_px[matches[:, 1]] - shown, axis=1)
-    return np.asarray(apart_px < 0.5 * period_px)
+    return np.asarray(apart_px < period_px / 2)
 
 
 def _share_in_place(

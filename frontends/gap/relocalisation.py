@@ -21,7 +21,7 @@ from dualslam.core.errors import SolverError
 from dualslam.core.geometry import se3
 from dualslam.core.geometry.projection import projection_jacobians
 from dualslam.core.geometry.triangulation import triangulate_n_view, triangulate_two_view
-from dualslam.core.noise_model import MIN_CONSENSUS
+from dualslam.core.noise_model import LEAST, MIN_CONSENSUS
 from dualslam.core.types import BoolArray, Failure, FailureReason, FloatArray
 from dualslam.frontends.gap.auxiliary_map import TrackViews, triangulate
 from dualslam.frontends.gap.uncertainty import gap_uncertainty
@@ -128,13 +128,13 @@ def _length(xyz: FloatArray, uv_px: FloatArray, seen: BoolArray, T_others_v: Flo
     t = T_others_v[v, :3, 3]
     e, d = a[:, :2] - x * a[:, 2:], x * t[:, 2:] - t[:, :2]
     e2 = np.einsum("ij,ij->i", e, e)
-    s = np.einsum("ij,ij->i", e, d) / np.maximum(e2, 1e-300)
+    s = np.einsum("ij,ij->i", e, d) / np.maximum(e2, LEAST)
     # Pixels move by about |e| / a_z for a relative change of s; where that is nothing, s is anything.
     weight = np.where(a[:, 2] > 0, np.sqrt(e2) / np.where(a[:, 2] > 0, a[:, 2], 1.0), 0.0)
     if len(s) < MIN_CONSENSUS or not weight.sum() > 0:
         return None
     order = np.argsort(s, kind="stable")
-    half = np.searchsorted(np.cumsum(weight[order]), 0.5 * weight.sum())
+    half = np.searchsorted(np.cumsum(weight[order]), weight.sum() / 2)
     length = float(s[order[min(int(half), len(s) - 1)]])
     return length if length > 0 else None
 

@@ -24,7 +24,7 @@ from dualslam.core.geometry import se3
 from dualslam.core.geometry.distortion import division_area_ratio, undistort_division
 from dualslam.core.geometry.two_view import fundamental_from_pose, sampson_error
 from dualslam.core.interfaces import Frontend
-from dualslam.core.noise_model import INFLATION
+from dualslam.core.noise_model import GATE_SIGMAS, INFLATION
 from dualslam.core.types import Failure, FailureReason, Features, FloatArray
 from dualslam.frontends.tracking.resection import poselib_camera
 
@@ -117,7 +117,7 @@ class _Pair:
         xy_a, xy_b = self.uv_a / self.radius_px, self.uv_b / self.radius_px
         a, b = (self.radius_px * undistort_division(xy, lens) for xy in (xy_a, xy_b))
         zoom_a, zoom_b = (np.abs(division_area_ratio(xy, lens)) ** -0.5 for xy in (xy_a, xy_b))
-        return _Straight(a, b, 0.5 * (zoom_a + zoom_b), self.sigma_px)
+        return _Straight(a, b, (zoom_a + zoom_b) / 2, self.sigma_px)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -134,7 +134,7 @@ class _Straight:
     ) -> poselib.CameraPose:
         """Return a relative pose by RANSAC, of at least and at most so many iterations."""
         least, most = iterations
-        gate_px = 3.0 * self.sigma_px
+        gate_px = GATE_SIGMAS * self.sigma_px
         options = {"max_epipolar_error": gate_px, "min_iterations": least, "max_iterations": most, "seed": seed}
         camera = poselib_camera(_K(focal), (1, 1))
         return poselib.estimate_relative_pose(self.a, self.b, camera, camera, options, {})[0]
@@ -158,7 +158,7 @@ def _find_pairs(
 ) -> Iterator[_Pair]:
     """Yield for frames spread over all the pair that is likely to tell most: many matches that have gone far."""
     rng = np.random.default_rng(seed)
-    middle: FloatArray = 0.5 * (np.array(size_px, float) - 1.0)
+    middle: FloatArray = (np.array(size_px, float) - 1.0) / 2
     for first in range(0, len(features) - 1, max(1, -(-len(features) // MAX_PAIRS))):
         best, most = None, 0.0
         for lag in LAGS:
@@ -177,11 +177,11 @@ def _find_pairs(
         if best is None:
             continue
         uv_a, uv_b, sigma = best
-        options = {"max_epipolar_error": 3.0 * sigma, "max_iterations": 300, "min_iterations": 50, "seed": seed}
+        options = {"max_epipolar_error": GATE_SIGMAS * sigma, "max_iterations": 300, "min_iterations": 50, "seed": seed}
         inlier = np.array(poselib.estimate_fundamental(uv_a, uv_b, options, {})[1]["inliers"], bool)
         chosen = rng.permutation(np.flatnonzero(inlier))[:MAX_MATCHES]
         if len(chosen) >= MIN_MATCHES:
-            yield _Pair(uv_a[chosen] - middle, uv_b[chosen] - middle, sigma, 0.5 * max(size_px))
+            yield _Pair(uv_a[chosen] - middle, uv_b[chosen] - middle, sigma, max(size_px) / 2)
 
 
 # --- how well a camera explains a pair

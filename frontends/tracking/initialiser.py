@@ -24,8 +24,7 @@ from dualslam.core.interfaces import START_REACH, Frontend
 from dualslam.core.noise_model import GATE_SIGMAS, PROOF_VIEWS, START_POINTS, TINY
 from dualslam.core.types import Failure, FailureReason, Features, FloatArray, Matches, Start, View
 from dualslam.frontends.features.motion_statistics import match_by_motion, nearest_search
-from dualslam.frontends.tracking.direction import direction_angle_deg, direction_sigma_deg
-from dualslam.frontends.tracking.start_proof import StartProof, ViewPair
+from dualslam.frontends.tracking.start_proof import StartProof, ViewPair, direction_angle_deg, direction_sigma_deg
 from dualslam.frontends.tracking.two_view_hypotheses import RelativePoses
 
 MIN_MATCHES = round(1.2 * START_POINTS)
@@ -226,7 +225,7 @@ class Initialiser:
         n_explained = int((good | (fits & (moved_px < GATE_SIGMAS * sigma_b))).sum())
         angle = np.degrees(np.arccos(np.clip(points.cos_parallax[good], -1, 1)))
         # Points without parallax are no points of the map: their depth is anything.
-        good[good] = angle > 0.5 * MIN_PARALLAX_DEG
+        good[good] = angle > MIN_PARALLAX_DEG / 2
         parallax = float(np.median(angle)) if len(angle) else 0.0
         n_near = int((angle >= MIN_PARALLAX_DEG).sum())
         return ViewPair(a, b, matches, T_b_a, points.xyz, good, n_explained, parallax, n_near)

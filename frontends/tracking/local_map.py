@@ -11,8 +11,11 @@ from dualslam.core.arrays import quantile
 from dualslam.core.camera.base import Camera
 from dualslam.core.geometry import se3
 from dualslam.core.geometry.projection import project_points
+from dualslam.core.interfaces import Frontend
+from dualslam.core.matchers import CELLS, Sighting
 from dualslam.core.noise_model import MAJORITY, PROOF_VIEWS, TINY
-from dualslam.core.types import BoolArray, FloatArray, IntArray
+from dualslam.core.types import BoolArray, Features, FloatArray, IntArray
+from dualslam.frontends.features.matching import FeatureGrid, match_projected
 from dualslam.map.submap import Submap
 
 VIEW_COSINE_MIN = 0.5  # a patch seen from more than 60 degrees off its mean direction does not look the same
@@ -137,3 +140,32 @@ def nearer_than_proven(depth: FloatArray, proven: BoolArray) -> BoolArray:
 def stands_before(depth: FloatArray, others: FloatArray) -> BoolArray:
     """Return which points (N,) stand far before all but a few others (M,)."""
     return np.asarray(depth <= NEARER * quantile(others, NEAREST))
+
+
+def look(
+    frontend: Frontend,
+    camera: Camera,
+    submap: Submap,
+    landmark_ids: IntArray,
+    T_cam_submap: FloatArray,
+    K: FloatArray,
+    features: Features,
+    radius_px: float,
+) -> Sighting:
+    """Look for landmarks of a submap in an image, about where they should be under a pose: see `Look`."""
+    local = LocalMap.of_landmarks(submap, landmark_ids)
+    seen = local.predict(T_cam_submap, K, camera, frontend.scale_factor, frontend.n_octaves)
+    feature = np.full(len(seen.rows), -1, np.int64)
+    if len(features) and len(seen.rows):
+        matches = match_projected(
+            frontend,
+            FeatureGrid.build(features.uv_rect_px),
+            features,
+            seen.uv_px,
+            radius_px * frontend.scale_factor**seen.octave,
+            local.descriptors[seen.rows],
+            octave=seen.octave,
+        )
+        feature[matches.index[:, 0]] = matches.index[:, 1]
+    part = np.clip(camera.unrectify(seen.uv_px) / camera.size_px * CELLS, 0, CELLS - 1).astype(np.int64)
+    return Sighting(local.landmark_ids[seen.rows], feature, CELLS * part[:, 1] + part[:, 0])

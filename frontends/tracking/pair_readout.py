@@ -128,7 +128,7 @@ class ReadoutEstimator:
         RANSAC gives the poses for the shortest and the longest time. From there each pose is refined from that of the
         neighbouring time, upwards and downwards: RANSAC's own scatter would hide the differences between times.
         """
-        sigma_px = np.sqrt(0.5 * (a.sigma_px**2 + b.sigma_px**2))
+        sigma_px = np.sqrt((a.sigma_px**2 + b.sigma_px**2) / 2)
         lens = poselib_camera(camera.K, camera.size_px)
         gate_px = CHI2_95[1] ** 0.5 * float(np.median(sigma_px))
         readouts_s = self._direction * np.append(READOUTS_S, -READOUTS_S[TYPICAL])
@@ -152,7 +152,7 @@ class ReadoutEstimator:
 
 def is_fast(rate_rad_s: FloatArray, camera: Camera) -> bool:
     """Whether a typical readout would shift the first and last rows of such a view by more than lens errors."""
-    return bool(0.5 * READOUTS_S[TYPICAL] * camera.K[0, 0] * np.linalg.norm(rate_rad_s) > MIN_SHIFT_PX)
+    return bool(READOUTS_S[TYPICAL] / 2 * camera.K[0, 0] * np.linalg.norm(rate_rad_s) > MIN_SHIFT_PX)
 
 
 def _minimum(chi2: FloatArray, best: int) -> float:
@@ -160,7 +160,7 @@ def _minimum(chi2: FloatArray, best: int) -> float:
     if not 0 < best < len(chi2) - 1:
         return float(READOUTS_S[best])
     left, middle, right = chi2[best - 1 : best + 2]
-    return float(READOUTS_S[best] + 0.5 * STEP_S * (left - right) / max(left - 2 * middle + right, TINY))
+    return float(READOUTS_S[best] + STEP_S / 2 * (left - right) / max(left - 2 * middle + right, TINY))
 
 
 def _mean(chi2: FloatArray) -> float:

@@ -17,7 +17,7 @@ from dualslam.core.interfaces import Frontend, PixelMatcher
 from dualslam.core.matchers import PixelMatches, PosedImage
 from dualslam.core.noise_model import TINY
 from dualslam.core.types import Failure, Features, FloatArray, FrameMethod, IntArray, Track, View
-from dualslam.frontends.features.found_features import features_found
+from dualslam.frontends.features.image_features import features_found
 from dualslam.frontends.tracking.keyframe_images import KeyframeImages
 from dualslam.frontends.tracking.turning import find_as_read
 from dualslam.map.submap import NO_LANDMARK, Submap

@@ -26,7 +26,6 @@ from dualslam.frontends.gap.second_pose import refuse_second_pose
 from dualslam.frontends.tracking.local_map import LocalMap
 from dualslam.frontends.tracking.mapper import MIN_PARALLAX_DEG
 from dualslam.frontends.tracking.resection import estimate_pose
-from dualslam.frontends.tracking.shared_landmarks import share_landmarks
 from dualslam.frontends.tracking.two_view_hypotheses import estimate_relative_pose
 from dualslam.map.landmark_views import landmark_covariances, pixel_covariances
 from dualslam.map.submap import NO_LANDMARK, Submap
@@ -245,3 +244,46 @@ def _rows_of(columns: list[IntArray], local: LocalMap) -> csr_array:
     """Return a matrix of ones in some columns of each row, one column for each landmark."""
     ends = np.cumsum([0, *map(len, columns)])
     return csr_array((np.ones(ends[-1], np.int32), np.concatenate(columns), ends), (len(columns), len(local)))
+
+
+def share_landmarks(submap: Submap, matches: Collection[tuple[int, int, IntArray]]) -> int:
+    """Let matched features of keyframes see one landmark, where one of the two has any, in place.
+
+    A landmark is seen once in a keyframe: what would give it two features there is passed over.
+
+    `matches`: two keyframes each, and (N, 2) their features that show the same.
+
+    Returns int: how many pairs of features have come to see one landmark.
+    """
+    obs = submap.observations
+    rows = np.flatnonzero(obs["alive"])
+    seen_in: dict[int, set[int]] = {}
+    for landmark, k in zip(obs["landmark"][rows].tolist(), obs["kf"][rows].tolist(), strict=True):
+        seen_in.setdefault(landmark, set()).add(k)
+    landmark_of = {k: ids.tolist() for k, ids in submap.landmark_of.items()}
+    heir: dict[int, int] = {}
+    added: dict[tuple[int, int], int] = {}
+
+    def now(landmark: int) -> int:
+        while landmark in heir:
+            landmark = heir[landmark]
+        return landmark
+
+    for k_a, k_b, pairs in matches:
+        for f_a, f_b in pairs.tolist():
+            a, b = now(landmark_of[k_a][f_a]), now(landmark_of[k_b][f_b])
+            if a == b:
+                continue
+            if NO_LANDMARK in (a, b):
+                k, feature, landmark = (k_a, f_a, b) if a == NO_LANDMARK else (k_b, f_b, a)
+                if k not in seen_in[landmark]:
+                    seen_in[landmark].add(k)
+                    landmark_of[k][feature] = added[k, feature] = landmark
+            elif seen_in[a].isdisjoint(seen_in[b]):
+                keep, drop = (a, b) if len(seen_in[a]) >= len(seen_in[b]) else (b, a)
+                seen_in[keep] |= seen_in.pop(drop)
+                heir[drop] = keep
+    submap.merge_landmarks(np.array([now(j) for j in heir], np.int64), np.array(list(heir), np.int64))
+    kf, feature = np.array(list(added), np.int64).reshape(-1, 2).T
+    submap.add_observations(kf, feature, np.array([now(j) for j in added.values()], np.int64))
+    return len(heir) + len(added)

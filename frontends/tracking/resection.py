@@ -9,6 +9,7 @@ import poselib
 
 from dualslam.core.geometry import se3
 from dualslam.core.geometry.projection import PoseEstimate, refine_pose
+from dualslam.core.noise_model import GATE_SIGMAS
 from dualslam.core.types import BoolArray, Failure, FloatArray
 
 MIN_SAMPLE = 3
@@ -45,7 +46,7 @@ def resect(
     """
     camera = poselib_camera(K, size_px)
     options: dict[str, Any] = {
-        "max_reproj_error": 3.0 * sigma_px,
+        "max_reproj_error": GATE_SIGMAS * sigma_px,
         "max_iterations": max_iterations,
         "min_iterations": 50,
         "seed": seed,

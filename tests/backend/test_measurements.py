@@ -13,8 +13,8 @@ import pytest
 from dualslam.backend.measurements.base import Gauge, Mount, noise
 from dualslam.backend.measurements.conformance import CHECKS
 from dualslam.backend.measurements.exports import GTSAM_GRAPH, GTSAM_VALUES
+from dualslam.backend.measurements.kinds import RotationRate
 from dualslam.backend.measurements.registry import BUILT_IN, measurement_class, readings_of
-from dualslam.backend.measurements.rotation_rate import RotationRate
 from dualslam.backend.measurements.solve import solve_metric
 from dualslam.core.atlas_problem import AtlasEdges
 from dualslam.core.errors import InputError

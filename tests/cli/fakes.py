@@ -7,13 +7,13 @@ from collections.abc import Callable
 import numpy as np
 
 from dualslam.atlas.atlas import Atlas
+from dualslam.atlas.record import StageTimer
 from dualslam.atlas.trajectory import FramePose
 from dualslam.core.camera.base import Camera
 from dualslam.core.camera.models import PinholeCamera
 from dualslam.core.config.settings import Config
 from dualslam.core.events import EventKind, EventLog
 from dualslam.core.jobs import InlineDesk
-from dualslam.core.stage_timer import StageTimer
 from dualslam.core.types import Features, FloatArray, Frame, FrameStatus, Keyframe, View
 from dualslam.map.frame_numbers import FrameNumbers
 from dualslam.map.frame_records import FrameResult, FrameRow

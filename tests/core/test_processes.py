@@ -10,7 +10,7 @@ from multiprocessing.connection import Connection
 
 import pytest
 
-from dualslam.core.processes import hear_interrupts, start_undisturbed
+from dualslam.core.resources import hear_interrupts, start_undisturbed
 
 
 def _wait(pipe: Connection) -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from PIL import ExifTags, Image
 
-from dualslam.io.exif import focal_over_longer_side
+from dualslam.io.file_metadata import focal_over_longer_side
 
 TAG = ExifTags.Base
 

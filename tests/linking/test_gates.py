@@ -10,7 +10,6 @@ from dualslam.core.config.settings import LinkingConfig
 from dualslam.core.geometry import se3, sim3
 from dualslam.core.types import FailureReason, FloatArray
 from dualslam.linking import propose_correspondences, verify
-from dualslam.linking.deformation import measure_deformation
 from dualslam.linking.join_test import (
     PAIR_CHI2,
     PIXEL_CHI2,
@@ -23,7 +22,7 @@ from dualslam.linking.join_test import (
 )
 from dualslam.linking.motion import MIN_ASKED, Motion
 from dualslam.linking.pairs import PairModel
-from dualslam.linking.timeline import ask_keyframes, find_discontinuities, leading_run
+from dualslam.linking.timeline import ask_keyframes, find_discontinuities, leading_run, measure_deformation
 from dualslam.testing.adversaries import ONSET_ID, corrupted_tail
 from dualslam.testing.link_worlds import Case, make_case
 

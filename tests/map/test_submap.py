@@ -7,9 +7,9 @@ import time
 import numpy as np
 import pytest
 
+from dualslam.atlas.record import StageTimer
 from dualslam.core.events import EventKind, EventLog
 from dualslam.core.geometry import se3
-from dualslam.core.stage_timer import StageTimer
 from dualslam.core.types import Keyframe, Start, View
 from dualslam.map.anchors import RelativePose
 from dualslam.map.submap import NO_LANDMARK, Submap

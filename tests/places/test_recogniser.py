@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from dualslam.core.types import Features, FloatArray, Keyframe
-from dualslam.frontends.features.hamming import hamming_distance
+from dualslam.frontends.features.orb import hamming_distance
 from dualslam.frontends.features.sift import SiftFrontend
 from dualslam.map.submap import Submap
 from dualslam.places import FaissRecogniser

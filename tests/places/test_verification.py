@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from functools import cache
+from functools import cache, partial
 
 import numpy as np
 
@@ -10,7 +10,7 @@ from dualslam.build import create_frontend
 from dualslam.core.config.settings import FrontendConfig, LinkingConfig
 from dualslam.core.geometry import se3, sim3, so3
 from dualslam.core.types import FailureReason
-from dualslam.frontends.place_matcher import FrontendPlaceMatcher
+from dualslam.frontends.tracking.local_map import look
 from dualslam.linking.join_test import ambiguity_gate
 from dualslam.map.submap import Submap
 from dualslam.places import PlaceMatch, PlaceVerifier, find_second_pose
@@ -20,7 +20,8 @@ from tests.places.worlds import N_LAP, driven_lap, run, twice_the_same
 
 @cache
 def verifier() -> PlaceVerifier:
-    return PlaceVerifier(FrontendPlaceMatcher(create_frontend(FrontendConfig()), CAMERA), LinkingConfig(), 0)
+    frontend = create_frontend(FrontendConfig())
+    return PlaceVerifier(frontend, partial(look, frontend, CAMERA), LinkingConfig(), 0)
 
 
 def keyframe_near(submap: Submap, index: int) -> int:

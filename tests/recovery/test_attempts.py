@@ -20,9 +20,8 @@ from dualslam.core.camera.models import PinholeCamera
 from dualslam.core.config.corruption import Corruption
 from dualslam.core.config.corruption import CorruptionKind as SpoilKind
 from dualslam.core.config.settings import AttemptConfig, Config, FrontendConfig, LinkingConfig, RecoveryConfig
-from dualslam.core.errors import ConfigError, SolverError
+from dualslam.core.errors import ConfigError, SolverError, how_to_install
 from dualslam.core.events import Event, EventKind
-from dualslam.core.extras import how_to_install
 from dualslam.core.geometry import se3, sim3
 from dualslam.core.grey_image import GreyImage
 from dualslam.core.jobs import JobKind, Limit

@@ -18,7 +18,7 @@ from dualslam.core.types import FrameStatus
 from dualslam.io.run_folder import FrameRow
 from dualslam.map.anchors import Anchor
 from dualslam.map.submap import Submap
-from dualslam.recovery.scale_parts import part_what_lost_its_scale
+from dualslam.recovery.scale_watch import part_what_lost_its_scale
 from dualslam.run.results import trajectories_of
 from dualslam.system.system import System
 from dualslam.testing.link_worlds import FRAME_STEP, thinned

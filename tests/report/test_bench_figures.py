@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from dualslam.cli.bench_figures import draw_figures
+from dualslam.cli.bench_command import draw_figures
 from dualslam.lab.bench.plan import plan_trials
 from dualslam.lab.bench.tables import bench_tables
 from dualslam.report.bench_figures import draw_statuses
@@ -37,7 +37,7 @@ def test_a_sequence_that_no_condition_takes_has_no_figure(tmp_path: Path) -> Non
 
 
 def test_without_matplotlib_the_tables_are_all(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("dualslam.cli.bench_figures.find_spec", lambda name: None)
+    monkeypatch.setattr("dualslam.cli.bench_command.find_spec", lambda name: None)
     assert draw_figures(SPEC, [], [], tmp_path) == []
     assert not list(tmp_path.iterdir())
 

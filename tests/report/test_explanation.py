@@ -9,10 +9,10 @@ from shutil import copy
 import pytest
 
 from dualslam.cli import main
+from dualslam.cli.explain_command import explain
 from dualslam.core.decisions import Decision, DecisionKind, Gate
 from dualslam.core.errors import InputError
 from dualslam.io.run_folder import DECISIONS, EVENTS, FRAMES, SUMMARY
-from dualslam.report.explanation import explain
 from tests.report.conftest import MakeRun
 
 

@@ -12,7 +12,7 @@ import pytest
 
 from dualslam.cli.parser import parse
 from dualslam.report import RunData
-from dualslam.report.next_steps import camera_words, next_steps
+from dualslam.report.trust import camera_words, next_steps
 
 
 def commands(run: RunData) -> list[str]:

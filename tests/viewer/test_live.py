@@ -20,8 +20,7 @@ import pytest
 
 from dualslam.cli import main
 from dualslam.core import walk_news
-from dualslam.core.errors import InputError, OutputError
-from dualslam.core.extras import how_to_install
+from dualslam.core.errors import InputError, OutputError, how_to_install
 from dualslam.core.geometry import sim3
 from dualslam.core.types import FloatArray, Frame, FrameStatus
 from dualslam.core.walk_news import WalkNews

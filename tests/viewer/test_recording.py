@@ -19,8 +19,8 @@ from rerun.chunk import RrdReader
 
 from dualslam.atlas.atlas import Atlas, Link, LinkKind
 from dualslam.cli import main
-from dualslam.core.errors import OutputError
-from dualslam.core.extras import how_to_install
+from dualslam.cli.view_command import open_viewer
+from dualslam.core.errors import OutputError, how_to_install
 from dualslam.core.geometry import sim3, so3
 from dualslam.core.types import FrameStatus, Keyframe
 from dualslam.io.map_store import load_atlas, save_atlas
@@ -31,7 +31,6 @@ from dualslam.report.run_data import PosedRows
 from dualslam.viewer.colours import ELSEWHERE, STATUS_COLOURS, SUBMAP_COLOURS
 from dualslam.viewer.playback import play, segments
 from dualslam.viewer.recording import make_recording
-from dualslam.viewer.window import open_viewer
 from tests.cli.fakes import NO_FEATURES
 from tests.cli.test_usage import one_sentence
 from tests.report.conftest import LOST, N_FRAMES, MakeRun
@@ -357,7 +356,7 @@ def started(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[tuple[list[str], d
         words = "INFO starting\nError: no graphics\n" if opened else ""
         return subprocess.CompletedProcess(command, int(opened), "", words)
 
-    monkeypatch.setattr("dualslam.viewer.window.subprocess.run", run)
+    monkeypatch.setattr("dualslam.cli.view_command.subprocess.run", run)
     return calls
 
 

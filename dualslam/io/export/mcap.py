@@ -13,8 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from dualslam.core.errors import InputError
-from dualslam.core.extras import how_to_install
+from dualslam.core.errors import InputError, how_to_install
 from dualslam.core.geometry import so3
 from dualslam.core.types import FloatArray, IntArray
 from dualslam.io.atomic import atomic_file

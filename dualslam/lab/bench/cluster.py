@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 
-from dualslam.core.errors import InputError
-from dualslam.core.extras import how_to_install
+from dualslam.core.errors import InputError, how_to_install
 from dualslam.lab.bench.plan import Trial
 from dualslam.lab.bench.pool import RunTrial
 from dualslam.lab.bench.record import TrialOutcome, TrialRecord, blank_record

@@ -12,8 +12,7 @@ from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from threading import Thread
 
-from dualslam.core.processes import hear_interrupts, start_undisturbed
-from dualslam.core.resources import limit_threads
+from dualslam.core.resources import hear_interrupts, limit_threads, start_undisturbed
 from dualslam.lab.bench.plan import Trial
 from dualslam.lab.bench.record import TrialOutcome, TrialRecord, blank_record
 

@@ -23,7 +23,7 @@ from dualslam.frontends.features.images import to_grey, to_rgb
 from dualslam.frontends.features.kornia.matchers import MIN_FEATURES, build_matcher
 from dualslam.frontends.features.kornia.options import MAX_ZOOM, NETWORK_TURN_DEG, KorniaOptions
 from dualslam.frontends.features.kornia.weights import Network
-from dualslam.frontends.registry import OptionedFrontend
+from dualslam.frontends.registry import N_FEATURES, OptionedFrontend
 
 MIN_SIDE_PX = 33
 """Smaller images have no features: the patches of a descriptor, and the networks' strides, are as large."""
@@ -48,7 +48,7 @@ class KorniaFrontend(OptionedFrontend):
     options: KorniaOptions
     options_model = KorniaOptions
 
-    def __init__(self, n_features: int = 1500, options: KorniaOptions | None = None) -> None:
+    def __init__(self, n_features: int = N_FEATURES, options: KorniaOptions | None = None) -> None:
         super().__init__(n_features, options)
         options = self.options
         self.max_distance, self.max_distance_strict = options.noise.max_distance, options.noise.max_distance_strict

@@ -151,7 +151,7 @@ class Network:
             # XFeat shrinks to multiples of 32 and scales pixel indices back, as if centres and not edges kept place.
             height, width = image.shape[2:]
             ratio = image.new_tensor([width / max(32, width // 32 * 32), height / max(32, height // 32 * 32)])
-            return _on_host(found["keypoints"] + 0.5 * (ratio - 1.0), found["scores"], found["descriptors"])
+            return _on_host(found["keypoints"] + (ratio - 1.0) / 2, found["scores"], found["descriptors"])
         if self._name == "disk":
             found = self._model(image, n=self._n, pad_if_not_divisible=True)[0]
             return _on_host(found.keypoints, found.detection_scores, found.descriptors)

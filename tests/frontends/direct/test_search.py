@@ -8,8 +8,8 @@ import pytest
 from numpy.typing import NDArray
 
 from dualslam.core.types import FloatArray
-from dualslam.frontends.direct.search import match_patches
 from dualslam.frontends.direct.warp import build_pyramid
+from dualslam.frontends.gap.refinding import match_patches
 
 SIZE = 240
 PLACE_TOLERANCE_PX = 0.3

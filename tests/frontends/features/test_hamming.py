@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from dualslam.frontends.features.hamming import hamming_distance, hamming_matrix
+from dualslam.frontends.features.orb import hamming_distance, hamming_matrix
 
 
 def _counted(a, b):

@@ -13,8 +13,7 @@ import torch
 from numpy.typing import NDArray
 
 from dualslam.core.config.settings import FrontendConfig
-from dualslam.core.errors import ConfigError, InputError
-from dualslam.core.extras import how_to_install
+from dualslam.core.errors import ConfigError, InputError, how_to_install
 from dualslam.core.types import Features
 from dualslam.frontends.conformance import CHECKS, Subject
 from dualslam.frontends.features.kornia.frontend import KorniaFrontend, inference

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from dualslam.core.types import IntArray
-from dualslam.frontends.tracking.shared_landmarks import share_landmarks
+from dualslam.frontends.tracking.registrar import share_landmarks
 from dualslam.map.submap import NO_LANDMARK, Submap
 from dualslam.testing.graph_scene import K, make_scene
 

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
-from dualslam.io.container import KEY, MAX_BOXES, edited_s, equivalent_focal_mm
+from dualslam.io.file_metadata import KEY, MAX_BOXES, edited_s, equivalent_focal_mm
 from dualslam.io.video import CROP_SIGMA, LOG_CROP, VideoFile
 
 OTHER = "com.apple.quicktime.camera.lens_model"
