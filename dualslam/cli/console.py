@@ -3,26 +3,19 @@
 from __future__ import annotations
 
 import sys
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from rich.console import Console, RenderableType
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
-from rich.text import Text
-
+from dualslam.cli.logs import CLEARED
 from dualslam.core.interfaces import Sequence
 from dualslam.report.statuses import count, seen_again
 from dualslam.run.session import Outcome, Watcher
-from dualslam.viewer.progress import RunState
-
-NAME_CHARACTERS = 24
-"""Of a sequence, before the bar: 80 columns have room for all."""
+from dualslam.viewer.progress import Progress
 
 
 @contextmanager
 def progress(sequence: Sequence, quiet: bool) -> Iterator[Watcher | None]:
-    """Show a bar on stderr while frames come in, if a person watches; otherwise nothing."""
+    """Say on stderr how far the frames are, if a person watches; otherwise nothing."""
     if quiet or not sys.stderr.isatty():
         yield None
         return
@@ -30,9 +23,11 @@ def progress(sequence: Sequence, quiet: bool) -> Iterator[Watcher | None]:
         total: int | None = len(sequence)
     except TypeError:  # a webcam has no length
         total = None
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TextColumn("{task.fields[left]}"))
-    with _Bars(*columns, console=Console(stderr=True), transient=True) as bars:
-        yield _Bar(bars, sequence.name, total)
+    shown = Progress(total)
+    try:
+        yield shown
+    finally:
+        shown.end()
 
 
 @contextmanager
@@ -41,29 +36,11 @@ def waiting(what: str, quiet: bool) -> Iterator[None]:
     if quiet or not sys.stderr.isatty():
         yield
         return
-    with Console(stderr=True).status(what):
+    print(f"{what} ...", end="", file=sys.stderr, flush=True)
+    try:
         yield
-
-
-class _Bars(Progress):
-    """Bar, count and time left on one line, what is being done on the next: neither crowds the other out."""
-
-    def get_renderables(self) -> Iterator[RenderableType]:
-        yield self.make_tasks_table(self.tasks)
-        for task in self.tasks:
-            yield Text(task.fields["state"], style="dim", no_wrap=True, overflow="ellipsis")
-
-
-class _Bar(RunState):
-    def __init__(self, bars: Progress, name: str, n_frames: int | None) -> None:
-        super().__init__(n_frames)
-        short = name if len(name) <= NAME_CHARACTERS else f"{name[: NAME_CHARACTERS - 1]}…"
-        self._bars, self._task = bars, bars.add_task(short, total=n_frames, state="", left="")
-
-    def changed(self) -> None:
-        left = self.time_left(time.monotonic())
-        words = "" if left is None else f"{left} left"
-        self._bars.update(self._task, completed=self.n_done, state=self.words, left=words)
+    finally:
+        print(CLEARED, end="", file=sys.stderr, flush=True)
 
 
 def final_line(outcome: Outcome) -> str:

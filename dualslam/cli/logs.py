@@ -7,6 +7,8 @@ import os
 import sys
 from logging.handlers import MemoryHandler
 
+CLEARED = "\r\x1b[K"
+"""Takes what a terminal shows of its last line away: how far a run is, and no message, stands there."""
 _CAPACITY = 1000
 _held: MemoryHandler | None = None
 
@@ -16,7 +18,9 @@ def set_up(verbose: int, quiet: bool) -> None:
     global _held
     level = logging.ERROR if quiet else (logging.WARNING, logging.INFO, logging.DEBUG)[min(verbose, 2)]
     stream = logging.StreamHandler(sys.stderr)
-    stream.setFormatter(logging.Formatter("%(levelname)s %(name)s: %(message)s"))
+    stream.setFormatter(
+        logging.Formatter(f"{CLEARED if sys.stderr.isatty() else ''}%(levelname)s %(name)s: %(message)s")
+    )
     _held = None if verbose else MemoryHandler(_CAPACITY, logging.CRITICAL, stream, flushOnClose=False)
     logging.basicConfig(level=level, handlers=[_held or stream], force=True)
     logging.captureWarnings(True)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
+from shutil import get_terminal_size
 from typing import TYPE_CHECKING, TextIO
 
 from dualslam.core.types import Frame
@@ -116,8 +117,11 @@ class Progress(RunState):
             if self._in_place:
                 self._stream.write("\n")
                 self._stream.flush()
+            self._width = 0
 
     def _write(self, line: str) -> None:
+        if self._in_place:
+            line = line[: get_terminal_size().columns - 1]
         self._stream.write(f"\r{line:<{self._width}}" if self._in_place else f"{line}\n")
         self._stream.flush()
         self._width = len(line)

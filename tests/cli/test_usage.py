@@ -223,7 +223,7 @@ def test_warnings_wait_until_the_input_has_proved_good(
     assert "WARNING" in capsys.readouterr().err
 
 
-HEAVY = ("torch", "kornia", "matplotlib", "rerun", "cv2", "gtsam", "numpy", "scipy", "pydantic", "rich", "yaml")
+HEAVY = ("torch", "kornia", "matplotlib", "rerun", "cv2", "gtsam", "numpy", "scipy", "pydantic", "yaml")
 
 
 @pytest.mark.parametrize("statement", ["import dualslam", "import dualslam.cli", "from dualslam import limit_threads"])
