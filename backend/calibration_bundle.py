@@ -16,7 +16,7 @@ from dualslam.core.bundle import BundleProblem
 from dualslam.core.camera.corrected import LensCorrection
 from dualslam.core.chi_square import MEDIAN_CHI2
 from dualslam.core.errors import SolverError
-from dualslam.core.noise_model import MAX_TRIES, MIN_DEPTH_MU
+from dualslam.core.noise_model import MAX_TRIES, MIN_DEPTH_MU, TINY
 from dualslam.core.types import FloatArray
 
 MAX_ITERATIONS, TOLERANCE = 100, 1e-5
@@ -146,7 +146,7 @@ def _in_unit_of(kept: BundleProblem, problem: BundleProblem, state: State) -> St
         centre = problem.T_submap_kf[begin, :3, 3]
         distance = np.linalg.norm(problem.T_submap_kf[begin:end, :3, 3] - centre, axis=1)
         far = begin + int(np.argmax(distance))
-        unit = distance.max() / np.linalg.norm(T[far, :3, 3] - centre)
+        unit = distance.max() / max(np.linalg.norm(T[far, :3, 3] - centre), TINY)
         own = (first >= begin) & (first < end)
         T[begin:end, :3, 3] = centre + unit * (T[begin:end, :3, 3] - centre)
         xyz[own] = centre + unit * (xyz[own] - centre)

@@ -121,14 +121,16 @@ def calibrate_together(
     - `submaps`: are not changed. They have two keyframes or more.
     - `camera`, `config`, `robust_k`, `seed`, `present_covariance`: as for `estimate_calibration`.
 
-    Returns the estimate, and copies of the submaps, changed to it: each has its first keyframe and its unit as before.
+    Returns the estimate, and copies of the submaps, changed to it: each has its earliest keyframe and its unit as before.
     Raises `InputError` if the correction has no inverse somewhere in the image.
     """
-    start, ids = time.perf_counter(), [np.array(list(each.keyframes), np.int64) for each in submaps]
+    start, ids = time.perf_counter(), [np.array(sorted(each.keyframes), np.int64) for each in submaps]
     each_n = [TOGETHER_OBSERVATIONS * len(kf) for kf in ids]
     problem = _concatenate(
         [make_problem(s, kf, camera, n, seed) for s, kf, n in zip(submaps, ids, each_n, strict=True)]
     )
+    if len(problem.kf) < MIN_OBSERVATIONS:
+        return Failure(FailureReason.TOO_FEW_INLIERS, f"{len(problem.kf)} observations in {len(submaps)} maps")
     present = correction_of(camera)
     as_now = State(problem.T_submap_kf, problem.xyz_mu, present.vector)
     forgets = partial(geman_mcclure, shape=FORGETS_AT * noise_ratio(problem, as_now))

@@ -110,11 +110,14 @@ class TestTogether:
             raw, _ = old.observed_pixels(np.arange(len(old.observations)))
             np.testing.assert_allclose(uv, expected.rectify(raw)[0])
 
-    def test_the_maps_get_better(self) -> None:
+    def test_the_maps_get_better_also_one_that_was_made_backwards(self) -> None:
         camera, truth = wrong_camera(), make_submap(TRUE, turning=True).keyframe_poses(np.arange(30))[:, :3, 3]
         maps = [make_submap(camera, turning=True, seed=i) for i in range(2)]
         for submap in maps:
             adjust_submap(submap, 1.345)
+        backwards = {k: maps[1].keyframes[k] for k in reversed(maps[1].keyframes)}  # as reverse tracking adds them
+        maps[1].keyframes.clear()
+        maps[1].keyframes.update(backwards)
         found = calibrate_together(maps, camera, None, config=CONFIG)
         assert found
         for old, new in zip(maps, found[1], strict=True):
