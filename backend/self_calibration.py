@@ -121,7 +121,7 @@ def calibrate_together(
     - `submaps`: are not changed. They have two keyframes or more.
     - `camera`, `config`, `robust_k`, `seed`, `present_covariance`: as for `estimate_calibration`.
 
-    Returns the estimate, and copies of the submaps, changed to it: each has its earliest keyframe and its unit as before.
+    Returns the estimate, and copies of the submaps, changed to it. Earliest keyframe and unit of each are as before.
     Raises `InputError` if the correction has no inverse somewhere in the image.
     """
     start, ids = time.perf_counter(), [np.array(sorted(each.keyframes), np.int64) for each in submaps]
