@@ -123,6 +123,7 @@ def run_once(job: tuple[str, int], settings: dict[str, Any]) -> dict[str, Any]:
         "shared": overlap,
         "false": sum(share < SHARED_FALSE for share in overlap),
         "refused": [str(e.data.get("reason")) for e in system.events.of_kind(EventKind.LOOP_REFUSED)],
+        "rejected": len(system.events.of_kind(EventKind.CONNECTION_REJECTED)),
         "coverage": coverage,
         "ate_m": error,
         "ate_without_m": plain_error,

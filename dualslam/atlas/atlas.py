@@ -44,8 +44,10 @@ class Link:
         Shared keyframes that it stands on, ascending; none where the submaps share no frames.
     keyframe_a, keyframe_b : int
         The keyframes between which its factor stands; -1: the newest of `keyframes` that is there.
+    doubtful : bool
+        Whether it may be rejected where others contradict it.
     rejected : bool
-        Whether measurements contradict it: then it joins nothing.
+        The atlas does not believe it: it joins nothing, but is asked again at each solution.
     is_sure : bool
         Whether its scale may be relied on: if not, what lies beyond it has a doubt.
     """
@@ -58,6 +60,7 @@ class Link:
     keyframes: tuple[int, ...] = ()
     keyframe_a: int = -1
     keyframe_b: int = -1
+    doubtful: bool = True
     rejected: bool = False
     is_sure: bool = True
 
@@ -67,7 +70,9 @@ class Link:
         shared = tuple(sorted(full.keyframes.keys() & following.keyframes.keys()))
         middle = shared[len(shared) // 2]
         covariance = rollover_covariance(following, middle)
-        return cls(full.id, following.id, se3.IDENTITY, covariance, LinkKind.ROLLOVER, shared, middle, middle)
+        return cls(
+            full.id, following.id, se3.IDENTITY, covariance, LinkKind.ROLLOVER, shared, middle, middle, doubtful=False
+        )
 
     @classmethod
     def of_keyframes(
@@ -78,6 +83,7 @@ class Link:
         S_ka_kb: FloatArray,
         covariance: FloatArray,
         kind: LinkKind,
+        doubtful: bool = True,
     ) -> Link:
         """Make the link of a similarity that was measured between two keyframes.
 
@@ -88,12 +94,17 @@ class Link:
         T_a, T_b = atlas.submaps[a[0]].T_submap_kf[a[1]], atlas.submaps[b[0]].T_submap_kf[b[1]]
         Ad = sim3.adjoint(T_b)
         S_a_b = T_a @ S_ka_kb @ sim3.inverse(T_b)
-        return cls(a[0], b[0], S_a_b, Ad @ covariance @ Ad.T, kind, (), a[1], b[1])
+        return cls(a[0], b[0], S_a_b, Ad @ covariance @ Ad.T, kind, (), a[1], b[1], doubtful)
 
     @property
     def sigma_scale(self) -> float:
         """Standard deviation of the logarithm of its scale, which is the same in any frame."""
         return float(np.sqrt(self.covariance[6, 6]))
+
+    def attached_as(self, other: Link) -> bool:
+        """Whether it is the same connection as another state of it."""
+        places = ((k.a, k.b, k.keyframe_a, k.keyframe_b, k.keyframes, k.kind) for k in (self, other))
+        return next(places) == next(places)
 
     def attached(self, atlas: Atlas) -> tuple[int, int]:
         """Return the keyframes of a and b that its factor stands between, as they are there now."""

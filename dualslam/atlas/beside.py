@@ -83,15 +83,20 @@ class AtlasProblems:
         return skeletons
 
     def _make(self, touched: set[int], new: Sequence[Link], covariances: Covariances) -> list[Skeleton]:
+        fresh = set(map(id, new))
+
+        def known(link: Link) -> bool:
+            return id(link) not in fresh and not link.rejected
+
         return [
-            build_skeleton(self._record.atlas, component, links, covariances, self.views, newest=self._newest)
+            build_skeleton(self._record.atlas, component, links, covariances, self.views, known, newest=self._newest)
             for component, links in self._touched(touched, new)
         ]
 
     def _touched(self, touched: set[int], new: Sequence[Link]) -> Iterator[tuple[list[int], list[Link]]]:
         """Give the linked sets that new connections make of what they touch, each with its connections."""
         atlas = self._record.atlas
-        links = [*atlas.believed, *new]
+        links = [*atlas.links, *new]
         for component in joined(atlas.submaps, links):
             if touched & set(component):
                 yield component, [link for link in links if link.a in component]

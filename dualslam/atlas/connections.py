@@ -259,7 +259,7 @@ class Connections:
         late: bool = False,
     ) -> AtlasReport:
         """Take connections in, and move what solutions move; `late`: one submap after the other."""
-        solved = [Solved.of(*each) for each in zip(skeletons, solutions, strict=True)]
+        solved = [Solved.of(*each, new) for each in zip(skeletons, solutions, strict=True)]
         self._atlas.links.extend(new)
         report = replace(together([self._apply(s, late) for s in solved]), seconds=seconds)
         tell(self._record, report, solved, now)
@@ -284,14 +284,21 @@ class Connections:
         """Move all that a solution moves. Whatever can fail has been done before."""
         atlas, skeleton = self._atlas, solved.skeleton
         self._count_change(skeleton.component)
-        for m in skeleton.component:
-            atlas.placement.pop(m, None)
-        atlas.placement |= {move.submap_id: move.S_world_submap for move in solved.moves}
+        if solved.moves is not None:
+            for m in skeleton.component:
+                atlas.placement.pop(m, None)
+            atlas.placement |= {move.submap_id: move.S_world_submap for move in solved.moves}
+        believed = dict(zip(map(id, skeleton.links), solved.believed, strict=True))
+        changed: dict[bool, list[int]] = {True: [], False: []}
+        for i, link in enumerate(atlas.links):
+            if id(link) in believed and (kept := believed[id(link)]) == link.rejected:
+                atlas.links[i] = replace(link, rejected=not kept)
+                changed[kept].append(i)
         if late:
             self._mover.begin(solved.bends)
         else:
             self._mover.make(solved.bends)
-        return solved.report()
+        return solved.report(atlas.links, changed[True], changed[False])
 
 
 def _failed(detail: str) -> AtlasReport:

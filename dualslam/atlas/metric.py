@@ -45,7 +45,9 @@ class MetricMap:
         if len(frames) < 2:
             return None
         links = [link for link in atlas.believed if link.a in component and link.b in component]
-        skeleton = build_skeleton(atlas, component, links, covariances, NodeViews(), with_covariances=True)
+        skeleton = build_skeleton(
+            atlas, component, links, covariances, NodeViews(), lambda link: True, with_covariances=True
+        )
         S = np.empty((len(skeleton.nodes), 4, 4))
         submap = np.array([of_submap[i] for i in frames.index.tolist()], np.int64)
         node = np.empty(len(frames), np.int64)

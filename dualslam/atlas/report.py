@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from itertools import chain, compress, repeat
 
 import numpy as np
 
+from dualslam.atlas.atlas import Link
 from dualslam.atlas.moving import Move
 from dualslam.atlas.record import FrameStamp, Record
-from dualslam.atlas.skeleton import Skeleton
+from dualslam.atlas.skeleton import WITHIN, Skeleton
 from dualslam.atlas.warp import Warp
 from dualslam.core.atlas_problem import AtlasSolution
 from dualslam.core.events import EventKind
@@ -25,12 +27,15 @@ STILL = 1e-4
 class AtlasReport:
     """Effect of an atlas solution."""
 
-    factors: dict[str, int] = field(default_factory=dict)  # edges by kind
+    rejected: tuple[Link, ...] = ()  # all that are rejected now, in the linked sets that were solved
+    newly_rejected: tuple[Link, ...] = ()
+    readmitted: tuple[Link, ...] = ()
+    factors: dict[str, int] = field(default_factory=dict)  # edges by kind, rejected ones left out
     # Half the sum of squared whitened residuals.
     cost_before: float = 0.0
     cost_after: float = 0.0
     drift: float = 1.0
-    """Errors within submaps over what they claim, as connections show (the largest of the linked sets)."""
+    """Errors within submaps over what they claim, as sure connections show (the largest of the linked sets)."""
     newest_chi2: float | None = None
     """Of the connection that came last, against all others (7 degrees of freedom); None where nothing ties its ends."""
     bent: dict[int, float] = field(default_factory=dict)
@@ -46,21 +51,39 @@ class AtlasReport:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Solved:
-    """A linked set with its solution, and what that moves."""
+    """A linked set with its solution, and what that moves (None: all stays)."""
 
     skeleton: Skeleton
     solution: AtlasSolution
-    moves: list[Move]
+    moves: list[Move] | None
 
     @classmethod
-    def of(cls, skeleton: Skeleton, solution: AtlasSolution) -> Solved:
-        """Say what a solution moves."""
+    def of(cls, skeleton: Skeleton, solution: AtlasSolution, new: Sequence[Link]) -> Solved:
+        """Say what a solution moves. `new`: connections that came with it."""
+        if new and changes_nothing(skeleton, solution, new):
+            return cls(skeleton, solution, None)
         return cls(skeleton, solution, [] if skeleton.is_tree else moves_of(skeleton, solution))
 
     @property
     def bends(self) -> list[Move]:
         """The moves that bend a submap."""
-        return [move for move in self.moves if move.bent]
+        return [move for move in self.moves or () if move.bent]
+
+    @property
+    def n_within(self) -> int:
+        """Edges within submaps: the first of the problem, before the connections."""
+        return len(self.skeleton.problem.edges) - len(self.skeleton.links)
+
+    @property
+    def believed(self) -> list[bool]:
+        """Of the connections."""
+        return [bool(kept) for kept in self.solution.believed[self.n_within :]]
+
+    @property
+    def kinds(self) -> Iterator[str]:
+        """Of the edges that are believed."""
+        kinds = chain(repeat(WITHIN, self.n_within), (str(link.kind) for link in self.skeleton.links))
+        return compress(kinds, self.solution.believed.tolist())
 
     @property
     def newest_chi2(self) -> float | None:
@@ -68,17 +91,30 @@ class Solved:
         chi2 = self.solution.chi2[-1] if self.skeleton.links else float("nan")
         return float(chi2) if np.isfinite(chi2) else None
 
-    def report(self) -> AtlasReport:
-        """Report what was done."""
+    def report(self, links: Sequence[Link], readmitted: Sequence[int], newly_rejected: Sequence[int]) -> AtlasReport:
+        """Report what was done. `links`: of the atlas, in its current state; the others: rows of it."""
         return AtlasReport(
-            factors=dict(Counter(edge.kind for edge in self.skeleton.problem.edges)),
+            rejected=tuple(link for link in links if link.rejected and link.a in self.skeleton.component),
+            newly_rejected=tuple(links[i] for i in newly_rejected),
+            readmitted=tuple(links[i] for i in readmitted),
+            factors=dict(Counter(self.kinds)),
             cost_before=self.solution.cost_before,
             cost_after=self.solution.cost_after,
             drift=self.solution.drift,
             newest_chi2=self.newest_chi2,
             bent={move.submap_id: move.bend_mu for move in self.bends},
-            placed=placed_by(self.skeleton, self.solution),
+            placed=placed_by(self.skeleton, self.solution) if self.moves is not None else {},
         )
+
+
+def changes_nothing(skeleton: Skeleton, solution: AtlasSolution, new: Sequence[Link]) -> bool:
+    """Whether all that is new was rejected, and what was there before is believed as before."""
+    fresh = set(map(id, new))
+    n = len(skeleton.links)
+    for link, kept in zip(skeleton.links, solution.believed[len(solution.believed) - n :].tolist(), strict=True):
+        if kept == (link.rejected or id(link) in fresh):
+            return False
+    return True
 
 
 def moves_of(skeleton: Skeleton, solution: AtlasSolution) -> list[Move]:
@@ -110,6 +146,9 @@ def together(reports: Sequence[AtlasReport]) -> AtlasReport:
     for report in reports:
         factors.update(report.factors)
     return AtlasReport(
+        rejected=tuple(link for r in reports for link in r.rejected),
+        newly_rejected=tuple(link for r in reports for link in r.newly_rejected),
+        readmitted=tuple(link for r in reports for link in r.readmitted),
         factors=dict(factors),
         cost_before=sum(r.cost_before for r in reports),
         cost_after=sum(r.cost_after for r in reports),
@@ -118,6 +157,16 @@ def together(reports: Sequence[AtlasReport]) -> AtlasReport:
         bent={m: bend for r in reports for m, bend in r.bent.items()},
         placed={m: gone for r in reports for m, gone in r.placed.items()},
     )
+
+
+def named(link: Link) -> dict[str, object]:
+    """A connection as the event log names it."""
+    return {
+        "connection": str(link.kind),
+        "other_submap": link.a,
+        "keyframe": link.keyframe_b,
+        "other_keyframe": link.keyframe_a,
+    }
 
 
 def tell(record: Record, report: AtlasReport, solved: Sequence[Solved], now: FrameStamp) -> None:
@@ -131,8 +180,15 @@ def tell(record: Record, report: AtlasReport, solved: Sequence[Solved], now: Fra
         cost_before=report.cost_before,
         cost_after=report.cost_after,
         drift=report.drift,
+        rejected=[{"submap": link.b, **named(link)} for link in report.rejected],
         bent={str(m): bend for m, bend in report.bent.items()},
         largest_bend=max(report.bent.values(), default=0.0),
         largest_move=max(report.placed.values(), default=0.0),
         seconds=report.seconds,
     )
+    for kind, links in (
+        (EventKind.CONNECTION_REJECTED, report.newly_rejected),
+        (EventKind.CONNECTION_READMITTED, report.readmitted),
+    ):
+        for link in links:
+            record.event(kind, now, link.b, **named(link))

@@ -7,7 +7,7 @@ earlier solutions have bent is taken out of these measurements (`Atlas.warps`): 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence, Set
+from collections.abc import Callable, Mapping, Sequence, Set
 from dataclasses import dataclass
 
 import numpy as np
@@ -63,6 +63,7 @@ def build_skeleton(
     links: Sequence[Link],
     covariances: Covariances,
     views: NodeViews,
+    known: Callable[[Link], bool],
     more_nodes: Mapping[int, set[int]] | None = None,
     with_covariances: bool = False,
     newest: Mapping[int, int] | None = None,
@@ -70,9 +71,10 @@ def build_skeleton(
     """Make the problem of a linked set of submaps.
 
     - `component`: submaps that `links` join.
-    - `links`: all between them, in the order in which they arrived.
+    - `links`: all between them, also those that are rejected so far, in the order in which they arrived.
     - `covariances`: see `EdgeCovariances`.
     - `views`: what is remembered of the submaps.
+    - `known`: whether an earlier solution has believed a link.
     - `more_nodes`: keyframes, by submap, that are to be nodes besides.
     - `with_covariances`: ask for them also where there is nothing to optimise.
     - `newest`: by submap, the keyframe after which none is a node unless a link stands there.
@@ -94,7 +96,7 @@ def build_skeleton(
     T = np.concatenate([atlas.submaps[m].keyframe_poses(knots) for m, knots in knots_of.items()])
     S_world_node = np.concatenate([S_world_submap[m] @ T[rows[m].start : rows[m].stop] for m in component])
     within, steps = _within(atlas, of_submap, rows, T, covariances) if by_own_factors else _along(rows, T)
-    across = _across(atlas, links, knots_of, {node: i for i, node in enumerate(nodes)})
+    across = _across(atlas, links, knots_of, {node: i for i, node in enumerate(nodes)}, known)
     problem = AtlasProblem(S_world_node, reference[component[0]], _joined_edges(within, across))
     return Skeleton(component, problem, nodes, rows, reference, list(links), is_tree, T, steps)
 
@@ -124,9 +126,10 @@ def _knots_of(
 ) -> dict[int, list[int]]:
     wanted: dict[int, set[int]] = {m: set(more_nodes.get(m, set())) for m in component}
     for link in links:
-        k_a, k_b = link.attached(atlas)
-        wanted[link.a].add(k_a)
-        wanted[link.b].add(k_b)
+        if not link.rejected:
+            k_a, k_b = link.attached(atlas)
+            wanted[link.a].add(k_a)
+            wanted[link.b].add(k_b)
     return {m: skeleton_knots(atlas.submaps[m], wanted[m], newest.get(m)) for m in component}
 
 
@@ -135,9 +138,9 @@ def _initial(atlas: Atlas, component: list[int], links: Sequence[Link]) -> dict[
     trial = Atlas()
     trial.submaps = {m: atlas.submaps[m] for m in component}
     taken_in = set(map(id, atlas.links))
-    home = joined(component, [link for link in links if id(link) in taken_in])[0]
+    home = joined(component, [link for link in links if not link.rejected and id(link) in taken_in])[0]
     trial.placement = {m: atlas.placement[m] for m in home if m in atlas.placement}
-    trial.links = list(links)
+    trial.links = [link for link in links if not link.rejected]
     return trial.S_world_submap(component)
 
 
@@ -151,6 +154,10 @@ def skeleton_knots(submap: Submap, wanted: Set[int] = frozenset(), newest: int |
 def _reference(submap: Submap) -> int:
     """Return the keyframe that a submap's frame goes by: the first of its gauge."""
     return submap.living_keyframe(submap.gauge[0])
+
+
+def _nearest(knots: list[int], k: int) -> int:
+    return min(knots, key=lambda knot: (abs(knot - k), knot))
 
 
 def _within(
@@ -189,11 +196,12 @@ def _along(rows: Mapping[int, range], T: FloatArray) -> tuple[AtlasEdges, dict[i
 
 
 def _edges_within(i: IntArray, j: IntArray, S: FloatArray, C: FloatArray) -> AtlasEdges:
-    return AtlasEdges(i, j, S, C, (WITHIN,) * len(i))
+    none = np.zeros(len(i), bool)
+    return AtlasEdges(i, j, S, C, (WITHIN,) * len(i), none, none)
 
 
 def _joined_edges(a: AtlasEdges, b: AtlasEdges) -> AtlasEdges:
-    names = ("first", "second", "S_first_second", "covariance")
+    names = ("first", "second", "S_first_second", "covariance", "doubtful", "known")
     columns = {name: np.concatenate([getattr(a, name), getattr(b, name)]) for name in names}
     return AtlasEdges(kind=a.kind + b.kind, **columns)
 
@@ -225,6 +233,7 @@ def _across(
     links: Sequence[Link],
     knots_of: Mapping[int, list[int]],
     row: Mapping[Node, int],
+    known: Callable[[Link], bool],
 ) -> AtlasEdges:
     """Make the factors of connections."""
     if not links:
@@ -234,6 +243,8 @@ def _across(
     ends: list[tuple[Node, Node]] = []
     for link in links:
         k_a, k_b = link.attached(atlas)
+        if link.rejected:  # it is asked again, but adds no node: what does not count changes nothing
+            k_a, k_b = _nearest(knots_of[link.a], k_a), _nearest(knots_of[link.b], k_b)
         ends.append(((link.a, k_a), (link.b, k_b)))
     T_a, T_b = (np.array([atlas.submaps[m].T_submap_kf[k] for m, k in side]) for side in zip(*ends, strict=True))
     S_ka_kb = sim3.inverse(T_a) @ np.array([link.S_a_b for link in links]) @ T_b
@@ -246,4 +257,6 @@ def _across(
         S_ka_kb,
         C,
         tuple(str(link.kind) for link in links),
+        np.array([link.doubtful for link in links], bool),
+        np.array([known(link) for link in links], bool),
     )

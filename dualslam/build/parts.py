@@ -56,7 +56,7 @@ def place_parts(config: Config, frontend: Frontend, camera: Camera) -> PlacePart
 
 def atlas_solver(config: Config) -> GtsamAtlasSolver:
     """Build what solves the graph over all submaps."""
-    return GtsamAtlasSolver(config.graph.robust_k)
+    return GtsamAtlasSolver(config.atlas.robust, config.graph.robust_k)
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol, overload
 
-from dualslam.core.types import FloatArray, IntArray
+from dualslam.core.types import BoolArray, FloatArray, IntArray
 
 if TYPE_CHECKING:
     from dualslam.map.submap import Submap
@@ -24,6 +24,8 @@ class AtlasEdge:
     """(7, 7): of xi in ``S_first_second @ exp(xi)``: rotation, translation, log-scale, in the second keyframe's unit.
     """
     kind: str  # ``within`` a submap, or the kind of the connection
+    doubtful: bool = False  # where true, and where others contradict it, it may be rejected
+    known: bool = False  # whether an earlier solution has believed it
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -38,13 +40,15 @@ class AtlasEdges(Sequence[AtlasEdge]):
     S_first_second: FloatArray  # (E, 4, 4)
     covariance: FloatArray  # (E, 7, 7)
     kind: tuple[str, ...]
+    doubtful: BoolArray  # (E,)
+    known: BoolArray  # (E,)
 
     def __len__(self) -> int:
         return len(self.kind)
 
     def __iter__(self) -> Iterator[AtlasEdge]:
-        first, second = self.first.tolist(), self.second.tolist()
-        return map(AtlasEdge, first, second, self.S_first_second, self.covariance, self.kind)
+        first, second, doubtful, known = (a.tolist() for a in (self.first, self.second, self.doubtful, self.known))
+        return map(AtlasEdge, first, second, self.S_first_second, self.covariance, self.kind, doubtful, known)
 
     @overload
     def __getitem__(self, at: int) -> AtlasEdge: ...
@@ -59,6 +63,8 @@ class AtlasEdges(Sequence[AtlasEdge]):
             self.S_first_second[at],
             self.covariance[at],
             self.kind[at],
+            bool(self.doubtful[at]),
+            bool(self.known[at]),
         )
 
 
@@ -76,22 +82,23 @@ class AtlasSolution:
     """The optimum of an `AtlasProblem`."""
 
     S_world_node: FloatArray  # (N, 4, 4)
+    believed: BoolArray  # (E,): false for doubtful edges that were rejected
     chi2: FloatArray
-    """(E,): of connections against all others (7 degrees of freedom). NaN if nothing else ties the ends, for edges that
-    are no connection, and for all but the newest of many."""
-    # Half the sum of squared whitened residuals.
+    """(E,): of connections against all others that are believed (7 degrees of freedom). NaN if nothing else ties the
+    ends, for edges that are no connection, and for all but the newest of many that are not doubtful."""
+    # Half the sum of squared whitened residuals of the believed edges.
     cost_before: float
     cost_after: float
     drift: float = 1.0
-    """By how much larger than claimed the errors within submaps are, as connections show; 1 where none closes a cycle.
-    All sigmas within submaps have been taken that many times."""
+    """By how much larger than claimed the errors within submaps are, as connections show that are not doubtful; 1 where
+    none closes a cycle. All sigmas within submaps have been taken that many times."""
 
 
 class AtlasSolver(Protocol):
     """Solves graphs over Sim(3), and knows what a submap's own factors say about its inner similarities."""
 
     def solve(self, problem: AtlasProblem) -> AtlasSolution:
-        """Find the similarities that agree best with the edges.
+        """Find the similarities that agree best with the edges, without those that are wrong.
 
         Raises `SolverError`.
         """

@@ -45,6 +45,8 @@ class EventKind(StrEnum):
     LOOP_REFUSED = "loop_refused"
     MERGED = "merged"
     ATLAS_SOLVED = "atlas_solved"
+    CONNECTION_REJECTED = "connection_rejected"
+    CONNECTION_READMITTED = "connection_readmitted"
     INTERRUPTED = "interrupted"
 
 

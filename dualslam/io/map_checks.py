@@ -20,6 +20,7 @@ LINK_ROWS: Rows = {
     "S_a_b": ("f", (4, 4)),
     "covariance": ("f", (7, 7)),
     "keyframes_ab": ("i", (2,)),
+    "doubtful": ("b", ()),
     "rejected": ("b", ()),
     "is_sure": ("b", ()),
 }

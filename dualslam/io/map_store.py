@@ -71,6 +71,7 @@ def save_atlas(folder: str | Path, atlas: Atlas, poses: dict[int, FramePose], ca
         "S_a_b": np.array([link.S_a_b for link in links], np.float64).reshape(-1, 4, 4),
         "covariance": np.array([link.covariance for link in links], np.float64).reshape(-1, 7, 7),
         "keyframes_ab": np.array([(link.keyframe_a, link.keyframe_b) for link in links], np.int64).reshape(-1, 2),
+        "doubtful": np.array([link.doubtful for link in links], bool),
         "rejected": np.array([link.rejected for link in links], bool),
         "is_sure": np.array([link.is_sure for link in links], bool),
     }
@@ -179,11 +180,12 @@ def _links(arrays: Arrays, metadata: Mapping[str, Any]) -> list[Link]:
     ab, S_a_b, covariance = arrays["ab"].tolist(), arrays["S_a_b"], arrays["covariance"]
     kinds = [LinkKind(kind) for kind in metadata["link_kinds"]]
     ends, rejected = arrays["keyframes_ab"].tolist(), arrays["rejected"].tolist()
+    doubtful = arrays["doubtful"].tolist() if "doubtful" in arrays else [k is not LinkKind.ROLLOVER for k in kinds]
     is_sure = arrays["is_sure"].tolist() if "is_sure" in arrays else [C[6, 6] <= _EARLIER_SURE**2 for C in covariance]
-    rows = zip(ab, S_a_b, covariance, kinds, metadata["link_keyframes"], ends, rejected, is_sure, strict=True)
+    rows = zip(ab, S_a_b, covariance, kinds, metadata["link_keyframes"], ends, doubtful, rejected, is_sure, strict=True)
     links = []
-    for (a, b), S, C, kind, shared, (k_a, k_b), refused, sure in rows:
-        links.append(Link(a, b, S, C, kind, tuple(map(int, shared)), k_a, k_b, refused, sure))
+    for (a, b), S, C, kind, shared, (k_a, k_b), may_doubt, refused, sure in rows:
+        links.append(Link(a, b, S, C, kind, tuple(map(int, shared)), k_a, k_b, may_doubt, refused, sure))
     return links
 
 

@@ -47,7 +47,9 @@ _EVENT_KINDS: _Kinds = {
         + ("shared_keyframes", "sigma_rot_deg", "sigma_scale", "sigma_trans_mu", "skipped_frames", "tries"),
         ((int, float, type(None)), "a number"),
     ),
-    **dict.fromkeys(("agreeing_keyframes", "left", "lost", "old_submaps", "submaps"), ((list, type(None)), "a list")),
+    **dict.fromkeys(
+        ("agreeing_keyframes", "left", "lost", "old_submaps", "rejected", "submaps"), ((list, type(None)), "a list")
+    ),
     "factors": ((dict,), "a mapping"),
 }
 """Of what pages are made of; what else belongs to an event is shown as it is."""

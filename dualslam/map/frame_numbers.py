@@ -24,10 +24,11 @@ FRAMES_IN_EVENTS = (
     "lost_since",
     "onset",
     "other_frame",
+    "other_keyframe",
     "suspected_since",
     "torn",
 )
-"""Fields of events that hold frames: one or a list. A number below 0 is a mark."""
+"""Fields of events, or of a part of one, that hold frames: one or a list. A number below 0 is a mark."""
 
 
 Told = TypeVar("Told", Event, Decision)
@@ -101,4 +102,9 @@ class FrameNumbers:
                 return [told(each) for each in value]
             return value if value is None or value < 0 else type(value)(self.index_of(int(value)))
 
-        return {name: told(value) if name in FRAMES_IN_EVENTS else value for name, value in data.items()}
+        def within(value: Any) -> Any:
+            if isinstance(value, list | tuple):
+                return [within(each) for each in value]
+            return self.in_source(value) if isinstance(value, Mapping) else value
+
+        return {name: told(value) if name in FRAMES_IN_EVENTS else within(value) for name, value in data.items()}

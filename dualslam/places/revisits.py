@@ -269,7 +269,7 @@ class Revisits:
         (a, keyframe_a), (b, keyframe_b) = match.place, match.query
         together = any(a in component and b in component for component in self._record.atlas.components())
         kind = LinkKind.LOOP if together else LinkKind.MERGE
-        return Link(a, b, match.S_place_query, match.covariance, kind, (), keyframe_a, keyframe_b)
+        return Link(a, b, match.S_place_query, match.covariance, kind, (), keyframe_a, keyframe_b, doubtful=False)
 
     def _linked(
         self, closing: _Found, report: AtlasReport, live: VisualOdometry | None, now: FrameStamp

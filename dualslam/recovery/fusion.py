@@ -15,7 +15,7 @@ from dualslam.atlas.record import FrameStamp, Record
 from dualslam.core.config.settings import Config
 from dualslam.core.events import EventKind
 from dualslam.core.geometry import se3, sim3
-from dualslam.core.types import Failure, FloatArray, FrameStatus, IntArray
+from dualslam.core.types import Failure, FailureReason, FloatArray, FrameStatus, IntArray
 from dualslam.linking import LinkRefusal, estimate_link
 from dualslam.map.frame_observations import Change
 from dualslam.map.split import sound_copy
@@ -43,8 +43,9 @@ def fuse(
     new_id = job.submap.id
     joined = _current(record, job.lost[found.old_id], new_id, found, S_now_then)
     report = connections.connect([joined], now)
-    if report.failure is not None:
-        note_refused(record, found, new_id, report.failure, now)
+    if not report or any(link.attached_as(joined) for link in report.newly_rejected):
+        why = report.failure or Failure(FailureReason.CONTRADICTION, "the rest of the atlas contradicts the link")
+        note_refused(record, found, new_id, why, now)
         return False
     _note_link(record, EventKind.LINKED, found, joined, now, seconds)
     _hand_over(record, job, found, recovered_frames, now)
@@ -236,4 +237,4 @@ def _overlaps(record: Record, submap_ids: list[int], config: Config) -> Iterator
         link = found.unsure or found if isinstance(found, LinkRefusal) else found
         if not isinstance(link, Failure):
             known = link.S_old_new, link.covariance, LinkKind.RECOVERY, tuple(link.agreeing_keyframes.tolist())
-            yield Link(a, b, *known, is_sure=link is found)
+            yield Link(a, b, *known, doubtful=False, is_sure=link is found)

@@ -28,7 +28,7 @@ VERDICTS = {
     "doubtful": "Part of this trajectory is probably wrong.",
 }
 _EVENT_COLUMNS = {"frame": "num", "time": "num", "event": None, "submap": "num", "what belongs to it": "words"}
-_HEADS = ("frame", "submaps", "factors", "cost before", "cost after", "bent by", "moved by")
+_HEADS = ("frame", "submaps", "factors", "cost before", "cost after", "rejected", "bent by", "moved by")
 
 
 def report_page(run: RunData | str | Path) -> str:
@@ -247,20 +247,22 @@ def atlas_section(run: RunData) -> Markup | None:
     if not rows:
         return None
     words = (
-        "Each connection between submaps is a factor of one graph, solved when it comes. A submap is bent by the part "
-        "of a move that is not a change of its place; in its own unit."
+        "Each connection between submaps is a factor of one graph, solved when it comes. What is rejected stays in the "
+        "map and is ignored. A submap is bent by the part of a move that is not a change of its place; in its own unit."
     )
     return join([tag("p", words), cards(_HEADS, rows)])
 
 
 def _row(event: dict[str, Any]) -> tuple[str, ...]:
     factors = ", ".join(f"{n} {kind}" for kind, n in event.get("factors", {}).items())
+    rejected = ", ".join(f"{link['connection']} {link['other_submap']}-{link['submap']}" for link in event["rejected"])
     return (
         str(event["frame"]),
         ", ".join(map(str, event["submaps"])),
         factors,
         number(event["cost_before"], 3),
         number(event["cost_after"], 3),
+        rejected or "-",
         number(event["largest_bend"], 3),
         number(event["largest_move"], 3),
     )

@@ -53,6 +53,7 @@ class DriftingMap:
     drift: FloatArray = field(default_factory=lambda: np.array([1e-3] * 3 + [2e-3] * 3 + [4e-3]))
     noise_px: float = 0.3
     seed: int = 0
+    robust: bool = True
 
     def __post_init__(self) -> None:
         self.rng = np.random.default_rng(self.seed)
@@ -67,7 +68,7 @@ class DriftingMap:
             T.append(T[-1] @ steps[k] @ se3.inverse(self.T_true[k - 1]) @ self.T_true[k])
         self.S_drifted = np.array(T)
         self.record = Record()
-        self.solver = GtsamAtlasSolver(0.8)
+        self.solver = GtsamAtlasSolver(self.robust, 0.8)
         self.connections = Connections(
             self.record,
             self.solver,
@@ -212,9 +213,9 @@ def fit_similarity(from_: FloatArray, to: FloatArray) -> FloatArray:
     return sim3.from_parts(s, R, to.mean(0) - s * R @ from_.mean(0))
 
 
-def lap_in_submaps(n: int = 130, every: int = 50, **options: object) -> DriftingMap:
+def lap_in_submaps(n: int = 130, every: int = 50, robust: bool = True, **options: object) -> DriftingMap:
     """A lap and a bit, in submaps that have rolled over."""
-    world = DriftingMap(n, **options)  # type: ignore[arg-type]
+    world = DriftingMap(n, robust=robust, **options)  # type: ignore[arg-type]
     for k in range(n):
         world.add(k)
         if len(world.submap.keyframes) >= every and k < n - 10:

@@ -32,6 +32,7 @@ def relative_similarity(atlas: Atlas, solver: AtlasSolver, a: Node, b: Node) -> 
         links,
         solver.edge_covariances,
         NodeViews(),
+        known=lambda link: True,
         more_nodes=more_nodes,
         with_covariances=True,
     )

@@ -43,6 +43,7 @@ TOLD = {
     "loop_closed": "loop closed",
     "link_refused": "link refused",
     "cut": "wrong start cut off",
+    "connection_rejected": "connection rejected",
     "unreadable": "image unreadable",
     "interrupted": "interrupted",
 }

@@ -157,7 +157,8 @@ class LiveScene:
         for link in self.links:
             if link.a in self.drawn and link.b in self.drawn:
                 ends.append([self._centre(link.a, link.kf_a), self._centre(link.b, link.kf_b)])
-                colours.append([rgb(STATUS_COLOURS[FrameStatus.RECOVERED])] * 2)
+                colour = STATUS_COLOURS[FrameStatus.LOST if link.rejected else FrameStatus.RECOVERED]
+                colours.append([rgb(colour)] * 2)
         if not ends:
             return np.zeros((0, 2, 3), np.float32), np.zeros((0, 2, 3), np.uint8)
         return np.array(ends, np.float32), np.array(colours, np.uint8)

@@ -50,6 +50,7 @@ class LinkLine:
     kf_a: int
     b: int
     kf_b: int
+    rejected: bool
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -212,5 +213,5 @@ def _lines(system: System) -> list[LinkLine]:
     lines = []
     for link in system.atlas.links:
         kf_a, kf_b = link.attached(system.atlas)
-        lines.append(LinkLine(str(link.kind), link.a, kf_a, link.b, kf_b))
+        lines.append(LinkLine(str(link.kind), link.a, kf_a, link.b, kf_b, link.rejected))
     return lines

@@ -61,12 +61,34 @@ def test_a_tree_is_laid_out_along_its_links_and_nothing_bends() -> None:
     assert report
     assert report.factors == {"within": 8, "recovery": 1}
     assert not report.bent
+    assert not report.rejected
     assert report.cost_after < 1e-9
     for was, now in zip(before, state(world), strict=False):
         np.testing.assert_array_equal(was, now)
     np.testing.assert_array_equal(world.atlas.S_world_submap([0, 1])[1], link.S_a_b)
     (event,) = world.record.events.of_kind(EventKind.ATLAS_SOLVED)
     assert event.data["submaps"] == [0, 1]
+
+
+def would_accept(world: DriftingMap, link: Link) -> bool:
+    """Whether a solution with the connection would believe it."""
+    doubted = replace(link, doubtful=True)
+    (skeleton,) = world.connections._problems.now({link.a, link.b}, (doubted,))
+    return bool(world.connections._solver.solve(skeleton.problem).believed[-1])
+
+
+def test_the_only_tie_between_two_maps_is_never_rejected() -> None:
+    world = DriftingMap(40)
+    for k in range(20):
+        world.add(k)
+    world.begin_anew()
+    for k in range(20, 40):
+        world.add(k)
+    link = world.loop((0, 18), (1, 22), off=WRONG, sigmas=TINY)
+    report = world.connections.connect([link], world.now)
+    assert report.rejected == ()
+    assert report.newest_chi2 is None, "nothing else says anything of it"
+    assert world.atlas.components() == [[0, 1]]
 
 
 # --- a cycle
@@ -93,13 +115,81 @@ def test_a_loop_takes_the_drift_out_of_every_submap(seed: int) -> None:
     assert off @ np.linalg.solve(C, off) < 24.3  # 0.999 quantile, 7 degrees of freedom
 
 
-def test_a_loop_straightens_a_chain_that_has_drifted_three_times_as_much() -> None:
+@pytest.mark.parametrize("closed", [False, True])
+def test_a_false_connection_with_a_tiny_sigma_is_rejected_and_moves_nothing(closed: bool) -> None:
+    world = lap_in_submaps(seed=1)
+    if closed:
+        world.connections.connect([world.loop(*CLOSED)], world.now)
+    before = state(world)
+    wrong = world.loop((0, 20), (2, 122), off=WRONG, sigmas=TINY)
+    report = world.connections.connect([wrong], world.now)
+    assert [link.rejected for link in world.atlas.links] == [False] * (len(world.atlas.links) - 1) + [True]
+    assert len(report.newly_rejected) == 1
+    for was, now in zip(before, state(world), strict=True):
+        np.testing.assert_array_equal(was, now)
+    (event,) = world.record.events.of_kind(EventKind.CONNECTION_REJECTED)
+    assert event.data["connection"] == "loop"
+    # Asked again, it is rejected again, and adds nothing: what is solved once more stays.
+    world.connections.settle(world.now)
+    for was, now in zip(before, state(world), strict=True):
+        np.testing.assert_allclose(was, now, atol=5e-3)
+
+
+def test_without_doubt_it_is_obeyed() -> None:
+    world = lap_in_submaps(seed=1, robust=False)
+    world.connections.connect([world.loop(*CLOSED)], world.now)
+    good = rms(world.errors())
+    wrong = world.loop((0, 20), (2, 122), off=WRONG, sigmas=TINY)
+    report = world.connections.connect([wrong], world.now)
+    assert not report.rejected
+    assert max(report.bent.values()) > 0.1
+    assert rms(world.errors()) > 5 * good
+
+
+def test_a_true_loop_is_not_vetoed_by_a_chain_that_has_drifted_three_times_as_much() -> None:
     drift = 3 * np.array([1e-3] * 3 + [2e-3] * 3 + [4e-3])
     for seed in range(4):
         world = lap_in_submaps(seed=seed, drift=drift)
         before = rms(world.errors())
-        world.connections.connect([world.loop(*CLOSED)], world.now)
+        report = world.connections.connect([world.loop(*CLOSED)], world.now)
+        assert not report.rejected
         assert rms(world.errors()) < 0.7 * before
+
+
+def test_where_three_contradict_the_first_the_first_goes() -> None:
+    world = DriftingMap(235)
+    for k in range(100):
+        world.add(k)
+    world.begin_anew()
+    for k in range(110, 235):
+        world.add(k, sim3.exp([0.2, 1.0, 0.1, 3.0, 4.0, 5.0, 0.6]))
+    world.connections.connect([world.loop((0, 95), (1, 114), off=WRONG, kind=LinkKind.RECOVERY)], world.now)
+    assert [link.rejected for link in world.atlas.links] == [False]
+    world.connections.connect([world.loop((0, 3), (1, 123))], world.now)
+    assert [link.rejected for link in world.atlas.links] == [False, True]
+    world.connections.connect([world.loop((0, 40), (1, 160))], world.now)
+    report = world.connections.connect([world.loop((0, 80), (1, 200))], world.now)
+    assert [link.rejected for link in world.atlas.links] == [True, False, False, False]
+    assert len(report.readmitted) == 2
+    assert len(report.newly_rejected) == 1
+    assert rms(world.errors()) < 0.1
+    assert world.atlas.components() == [[0, 1]]
+
+
+def test_many_true_and_false_ones_at_once() -> None:
+    world = DriftingMap(230, seed=3)
+    for k in range(230):
+        world.add(k)
+    rng = np.random.default_rng(3)
+    links, true = [], []
+    for i in range(20):
+        first = int(rng.integers(0, 105))
+        true.append(i % 2 == 0)
+        off = None if true[-1] else rng.choice([-1, 1], 7) * WRONG
+        links.append(world.loop((0, first), (0, first + 120), off=off))
+    world.connections.connect(links, world.now)
+    assert [not link.rejected for link in world.atlas.links] == true
+    assert rms(world.errors()) < 0.05
 
 
 def test_the_same_again_to_the_bit() -> None:
@@ -112,13 +202,19 @@ def test_the_same_again_to_the_bit() -> None:
         np.testing.assert_array_equal(a, b)
 
 
-def test_a_loop_shows_how_far_odometry_is_to_be_believed() -> None:
+def test_what_is_beyond_doubt_shows_how_far_odometry_is_to_be_believed() -> None:
     drift = 8 * np.array([1e-3] * 3 + [2e-3] * 3 + [4e-3])
     world = lap_in_submaps(seed=1, drift=drift)
     before = rms(world.errors())
-    report = world.connections.connect([world.loop(*CLOSED)], world.now)
+    late, sure = world.loop((0, 9), (2, 128)), replace(world.loop(*CLOSED), doubtful=False)
+    assert not would_accept(world, late), "a chain that thinks that it knows better"
+    report = world.connections.connect([sure], world.now)
     assert report.drift > 2
+    assert not report.rejected
     assert rms(world.errors()) < 0.7 * before
+    late = world.loop((0, 9), (2, 128))
+    far, wrong = (world.loop((0, 40), (2, 100), off=off) for off in (None, 3 * WRONG))
+    assert [would_accept(world, link) for link in (late, far, wrong)] == [True, True, False]
 
 
 @pytest.mark.parametrize("way", [0.0, 300.0])
@@ -132,7 +228,7 @@ def test_a_seam_holds_at_its_keyframes_however_far_from_the_origin_they_are(way:
             world.roll_over()
     for link in world.atlas.links:
         assert within_sigmas(world, link, ROLLOVER_SIGMAS)
-    world.connections.connect([world.loop((0, 2), (2, 124))], world.now)
+    world.connections.connect([replace(world.loop((0, 2), (2, 124)), doubtful=False)], world.now)
     S = world.atlas.S_world_submap([0, 1, 2])
     for link in world.atlas.links[:2]:
         k = link.keyframe_a
@@ -218,6 +314,7 @@ def test_a_bend_that_another_camera_has_straightened_out_is_not_taken_out_twice(
         submap.relative_poses = {}  # what held the bend
         bend_submap(submap, Warp(warp.index, sim3.inverse(warp.S)))
         world.connections.follow(before, submap, world.now)
+    assert not any(link.rejected for link in world.atlas.links)
     assert rms(world.errors()) < 1.1 * good
 
 
@@ -237,11 +334,13 @@ class FrontEnd:
         self.adopted.append(before)
 
 
-def test_the_live_front_end_hears_of_a_bend() -> None:
+def test_the_live_front_end_hears_of_a_bend_and_of_nothing_else() -> None:
     world = lap_in_submaps(seed=1)
     front_end = FrontEnd(world.submap)
     world.front_ends.append(front_end)
     before = world.submap.keyframe_poses(list(world.submap.keyframes))
+    world.connections.connect([world.loop((0, 20), (2, 122), off=WRONG)], world.now)
+    assert not front_end.adopted
     world.connections.connect([world.loop(*CLOSED)], world.now)
     (was,) = front_end.adopted
     np.testing.assert_array_equal(was.keyframe_poses(list(was.keyframes)), before)
@@ -256,7 +355,7 @@ class Broken(GtsamAtlasSolver):
 def test_a_solver_that_fails_leaves_everything_as_it_was(monkeypatch: pytest.MonkeyPatch) -> None:
     world = lap_in_submaps(seed=1)
     before = state(world)
-    monkeypatch.setattr(world.connections, "_solver", Broken(0.8))
+    monkeypatch.setattr(world.connections, "_solver", Broken(True, 0.8))
     report = world.connections.connect([world.loop(*CLOSED)], world.now)
     assert not report
     assert len(world.atlas.links) == 2
@@ -277,9 +376,10 @@ def test_a_change_by_the_submaps_own_graph_takes_links_along_and_solves_again() 
     assert abs(rms(world.errors()) - good) < 0.1 * good
 
 
-def test_the_report_says_how_far_the_newest_connection_lies_from_all_others() -> None:
+@pytest.mark.parametrize("doubtful", [True, False])
+def test_the_report_says_how_far_the_newest_connection_lies_from_all_others(doubtful: bool) -> None:
     true, false = (
-        world.connections.connect([world.loop(*CLOSED, off=off)], world.now).newest_chi2
+        world.connections.connect([replace(world.loop(*CLOSED, off=off), doubtful=doubtful)], world.now).newest_chi2
         for world, off in ((lap_in_submaps(seed=1), None), (lap_in_submaps(seed=1), WRONG))
     )
     assert true is not None
@@ -312,8 +412,7 @@ def test_covariance_across_submaps_shrinks_with_a_loop() -> None:
 @pytest.fixture
 def closed_world() -> DriftingMap:
     world = lap_in_submaps(seed=1)
-    world.connections.connect([world.loop(*CLOSED), world.loop((0, 20), (2, 122))], world.now)
-    world.atlas.links[-1] = replace(world.atlas.links[-1], rejected=True)  # as measurements may
+    world.connections.connect([world.loop(*CLOSED), world.loop((0, 20), (2, 122), off=WRONG)], world.now)
     world.atlas.submaps[0].condemn(range(40, 50))
     return world
 
@@ -324,6 +423,7 @@ def test_a_map_comes_back_with_all_that_was_solved(closed_world: DriftingMap, tm
     stored = load_atlas(tmp_path / "map").atlas
     assert [link.rejected for link in stored.links] == [False, False, False, True]
     assert [(link.keyframe_a, link.keyframe_b) for link in stored.links[2:]] == [(3, 123), (20, 122)]
+    assert [link.doubtful for link in stored.links] == [False, False, True, True]
     was, now = (a.S_world_submap([0, 1, 2]) for a in (atlas, stored))
     for m in was:
         np.testing.assert_array_equal(was[m], now[m])
@@ -348,9 +448,10 @@ def test_a_map_of_the_next_version_is_refused(closed_world: DriftingMap, tmp_pat
 
 def test_each_edge_goes_from_a_keyframe_to_a_keyframe() -> None:
     edge = AtlasEdge(0, 1, np.eye(4), np.eye(7), "loop")
+    assert not edge.doubtful
     problem = AtlasProblem(np.array([np.eye(4)] * 2), 0, (edge,))
-    solution = GtsamAtlasSolver(0.8).solve(problem)
+    solution = GtsamAtlasSolver(True, 0.8).solve(problem)
     np.testing.assert_array_equal(solution.S_world_node, problem.S_world_node)
     np.testing.assert_allclose(
-        GtsamAtlasSolver(0.8).relative_covariances(problem, 0)[1], np.eye(7), rtol=1e-4, atol=1e-5
+        GtsamAtlasSolver(True, 0.8).relative_covariances(problem, 0)[1], np.eye(7), rtol=1e-4, atol=1e-5
     )

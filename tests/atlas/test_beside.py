@@ -76,6 +76,7 @@ def assert_same(world: DriftingMap, other: DriftingMap, atol: float = 1e-9) -> N
     for link, as_there in zip(world.atlas.links, other.atlas.links, strict=True):
         np.testing.assert_allclose(link.S_a_b, as_there.S_a_b, atol=atol)
         np.testing.assert_allclose(link.covariance, as_there.covariance, atol=atol)
+        assert link.rejected == as_there.rejected
     assert world.atlas.held == other.atlas.held
     np.testing.assert_allclose(world.errors(), other.errors(), atol=atol)
 
@@ -276,6 +277,7 @@ def test_a_solution_made_at_once_in_between_makes_the_late_one_void() -> None:
     assert report.factors["loop"] == 1
     assert report.factors["recovery"] == 1
     assert len(desk.asked) == 2
+    assert not any(link.rejected for link in world.atlas.links)
     assert rms(world.errors()) < 1.2 * rms(immediate().errors())
 
 

@@ -105,14 +105,16 @@ def test_the_ends_of_a_closed_lap_are_tied() -> None:
 def test_edges_come_out_of_their_arrays_as_they_were() -> None:
     rng = np.random.default_rng(0)
     S, C = rng.normal(size=(3, 4, 4)), rng.normal(size=(3, 7, 7))
+    yes = np.array([False, True, True])
     kinds = ("within", "loop", "rollover")
     edges = pickle.loads(
-        pickle.dumps(AtlasEdges(np.arange(3), np.arange(1, 4), S, C, kinds))  # as it goes to a worker
+        pickle.dumps(AtlasEdges(np.arange(3), np.arange(1, 4), S, C, kinds, yes, ~yes))  # as it goes to a worker
     )
     assert len(edges) == 3
     for i, edge in enumerate(edges):
         assert isinstance(edge, AtlasEdge)
         assert (edge.first, edge.second, edge.kind) == (i, i + 1, kinds[i])
+        assert (edge.doubtful, edge.known) == (bool(yes[i]), not yes[i])
         np.testing.assert_array_equal(edge.S_first_second, S[i])
         np.testing.assert_array_equal(edge.covariance, C[i])
     assert [edge.kind for edge in edges[-2:]] == ["loop", "rollover"]

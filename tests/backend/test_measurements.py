@@ -107,7 +107,7 @@ def drifted(truth: Trajectory, seed: int = 0, drift: float = 1.0) -> MetricProbl
     n = len(measured)
     edges = AtlasEdges(
         np.arange(n), np.arange(1, n + 1), np.array(measured), np.broadcast_to(np.diag(STEP_SIGMAS**2), (n, 7, 7)),
-        ("within",) * n,
+        ("within",) * n, np.zeros(n, bool), np.zeros(n, bool),
     )  # fmt: skip
     return MetricProblem(S_nodes, edges, truth.timestamps_s, sim3.act_on_pose(S_nodes[node], local), node)
 
@@ -356,15 +356,15 @@ def test_a_false_join_is_contradicted_by_heights():
     problem = drifted(truth, drift=0.1)
     e = problem.edges
     cut = 19
-    kind = list(e.kind)
-    kind[cut] = "recovery"
+    kind, doubtful = list(e.kind), e.doubtful.copy()
+    kind[cut], doubtful[cut] = "recovery", True
     S, C = e.S_first_second.copy(), e.covariance.copy()
     a, b = truth.T_world_cam[190].copy(), truth.T_world_cam[200].copy()
     b[2, 3] = a[2, 3]
     S[cut] = se3.inverse(a) @ b
     S[cut, :3, 3] *= 0.1
     C[cut] = np.diag(np.array([1e-3] * 3 + [5e-3] * 3 + [5e-3]) ** 2)
-    joined = replace(problem, edges=AtlasEdges(e.first, e.second, S, C, tuple(kind)))
+    joined = replace(problem, edges=AtlasEdges(e.first, e.second, S, C, tuple(kind), doubtful, e.known))
     heights = [MeasurementRow("height", (t, z, 0.3), "") for t, z in zip(truth.timestamps_s, p, strict=True)]
     gps = Receiver(seed=9).positions(truth)
     with_heights = solve(joined, gps, RowSource("barometer", heights, has_clock=False))
@@ -381,10 +381,10 @@ def test_a_gyroscope_contradicts_a_join_whose_turn_is_wrong(off_rad: float):
     moving = Trajectory(truth.timestamps_s, truth.T_world_cam @ rocking)
     problem = drifted(moving, drift=0.5)
     e, cut = problem.edges, 12
-    kind, S = list(e.kind), e.S_first_second.copy()
-    kind[cut] = "recovery"
+    kind, doubtful, S = list(e.kind), e.doubtful.copy(), e.S_first_second.copy()
+    kind[cut], doubtful[cut] = "recovery", True
     S[cut] = S[cut] @ sim3.exp(np.array([0.0, off_rad, 0.0, 0.0, 0.0, 0.0, 0.0]))
-    joined = replace(problem, edges=AtlasEdges(e.first, e.second, S, e.covariance, tuple(kind)))
+    joined = replace(problem, edges=AtlasEdges(e.first, e.second, S, e.covariance, tuple(kind), doubtful, e.known))
     p = moving.T_world_cam[:, :3, 3]
     rows = [
         MeasurementRow("distance", (a / RATE_HZ, b / RATE_HZ, np.linalg.norm(p[a] - p[b]), 0.2), "")

@@ -24,7 +24,7 @@ def ring(n, rng, noise=1.0, closing=True):
     for i in range(n if closing else n - 1):
         j = (i + 1) % n
         measured = np.linalg.inv(truth[i]) @ truth[j] @ sim3_exp(noise * SIGMAS * rng.normal(size=7))
-        edges.append(Sim3Edge(i, j, measured, COVARIANCE))
+        edges.append(Sim3Edge(i, j, measured, COVARIANCE, doubtful=j == 0))
     guess = {0: truth[0]}
     for e in edges[: n - 1]:
         guess[e.second] = guess[e.first] @ e.S_first_second
@@ -56,7 +56,24 @@ def test_closing_a_loop_takes_the_drift_out():
     true_scales = log_scales(dict(enumerate(truth)))
     drift = np.abs(log_scales(guess) - true_scales).max()
     assert np.abs(log_scales(solution.S_world_node) - true_scales).max() < drift
+    assert solution.inliers.all()
     assert solution.cost_after < solution.cost_before
+
+
+def test_false_links_are_refused():
+    rng = np.random.default_rng(2)
+    truth, edges, guess = ring(60, rng)
+    n_ring = len(edges)
+    for i in range(5, 25):
+        j = i + 30
+        S = np.linalg.inv(truth[i]) @ truth[j] @ sim3_exp(SIGMAS * rng.normal(size=7))
+        if i % 2:
+            S = S @ random_sim3(rng)
+        edges.append(Sim3Edge(i, j, S, COVARIANCE, doubtful=True))
+    solution = optimise_sim3(guess, edges, robust=True)
+    np.testing.assert_array_equal(solution.inliers[n_ring:], np.arange(5, 25) % 2 == 0)
+    assert solution.inliers[:n_ring].all()
+    assert centre_errors(solution.S_world_node, truth).max() < 0.5
 
 
 def test_each_piece_has_a_gauge():

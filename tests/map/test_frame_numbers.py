@@ -41,12 +41,17 @@ def test_events_name_frames_by_their_index() -> None:
     assert isinstance(told["change_point"], float)
 
 
-def test_frames_in_a_list_of_an_event_are_told_too() -> None:
+def test_frames_within_a_part_of_an_event_are_told_too_and_marks_stay() -> None:
     count = FrameNumbers(1000)
     for i in (20, 19, 18):
         count.number(i)
-    cut = {"old_submap": 1, "left": [1020, 1021], "factors": {"loop": 1020}}
-    assert count.in_source(cut) == {"old_submap": 1, "left": [20, 19], "factors": {"loop": 1020}}
+    solved = {"rejected": [{"submap": 1, "keyframe": 1021, "other_keyframe": -1}], "factors": {"loop": 1020}}
+    assert count.in_source(solved) == {
+        "rejected": [{"submap": 1, "keyframe": 19, "other_keyframe": -1}],
+        "factors": {"loop": 1020},
+    }
+    cut = {"old_submap": 1, "left": [1020, 1021]}
+    assert count.in_source(cut) == {"old_submap": 1, "left": [20, 19]}
 
 
 GREY = np.zeros((4, 6), np.uint8)

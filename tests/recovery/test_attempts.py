@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from dualslam.atlas.atlas import Link
+from dualslam.atlas.atlas import Link, LinkKind
 from dualslam.atlas.connections import Connections
 from dualslam.atlas.record import FrameStamp
 from dualslam.atlas.report import AtlasReport
@@ -284,22 +284,41 @@ class TestRetry:
         main = trajectories_of(system).main
         assert set(main.index.tolist()) == set(range(N + 30)) - COVERED
 
-    def test_so_it_is_where_the_atlas_cannot_be_solved(self, monkeypatch: pytest.MonkeyPatch) -> None:
+    @pytest.mark.parametrize(
+        "failure", [None, pytest.param(Failure(FailureReason.SOLVER, "singular"), marks=pytest.mark.slow)]
+    )
+    def test_so_it_is_where_the_atlas_refuses_the_link(
+        self, monkeypatch: pytest.MonkeyPatch, failure: Failure | None
+    ) -> None:
         asked, connect = [], Connections.connect
 
         def refuse_first(self: Connections, links: Sequence[Link], now: FrameStamp) -> AtlasReport:
             asked.append(links)
             if len(asked) > 1:
                 return connect(self, links, now)
-            return AtlasReport(failure=Failure(FailureReason.SOLVER, "singular"))
+            return AtlasReport(failure=failure, newly_rejected=() if failure else (replace(links[0], rejected=True),))
 
         monkeypatch.setattr(Connections, "connect", refuse_first)
         system = self.run(n_failing=0, n_frames=N + 10)
         first, second = system.events.of_kind(EventKind.RECOVERY_ENDED)
         assert [event.data["linked"] for event in (first, second)] == [False, True]
         refused = system.events.of_kind(EventKind.LINK_REFUSED)[-1]
-        assert (refused.frame, refused.data["reason"]) == (first.frame, "solver")
+        assert (refused.frame, refused.data["reason"]) == (first.frame, "solver" if failure else "contradiction")
         assert [event.frame for event in system.events.of_kind(EventKind.LINKED)] == [second.frame]
+
+    @pytest.mark.slow
+    def test_that_an_older_link_falls_refuses_no_new_one(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        connect = Connections.connect
+
+        def with_another_rejected(self: Connections, links: Sequence[Link], now: FrameStamp) -> AtlasReport:
+            older = replace(links[0], kind=LinkKind.LOOP, rejected=True)
+            return replace(connect(self, links, now), newly_rejected=(older,))
+
+        monkeypatch.setattr(Connections, "connect", with_another_rejected)
+        system = self.run(n_failing=0, n_frames=N)
+        assert system.events.of_kind(EventKind.LINKED)
+        assert system.events.of_kind(EventKind.FUSED)
+        assert not system._recoveries.waiting
 
     def test_it_ends_with_the_last_of_the_sizes_and_once_more_with_the_run(self) -> None:
         system = self.run(n_failing=9, n_frames=N + 50)  # so many that the new map grows beyond the size

@@ -271,12 +271,13 @@ def test_solutions_of_the_atlas_have_a_table(broken_run: RunData) -> None:
         "factors": {"within": 12, "recovery": 1, "loop": 1},
         "cost_before": 129.2,
         "cost_after": 0.34,
+        "rejected": [{"connection": "loop", "submap": 1, "other_submap": 0, "keyframe": 9, "other_keyframe": 3}],
         "largest_bend": 0.018,
         "largest_move": 1.4e-20,
     }
     without = [e for e in broken_run.events if e["event"] != "atlas_solved"]
     page = report_page(replace(broken_run, events=[*without, event]))
-    for words in ("Connections between submaps", "12 within, 1 recovery, 1 loop", "129", "0.018"):
+    for words in ("Connections between submaps", "12 within, 1 recovery, 1 loop", "129", "loop 0-1", "0.018"):
         assert words in page
     assert "e-20" not in page  # what rounding leaves of nought
     assert "Connections between submaps" not in report_page(replace(broken_run, events=without))

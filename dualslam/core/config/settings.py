@@ -278,6 +278,13 @@ class LinkingConfig(StrictModel):
         return self.wrong_scale
 
 
+class AtlasConfig(StrictModel):
+    """The graph over all submaps."""
+
+    robust: bool = True
+    """Whether a connection that the others contradict is rejected; else all of them are obeyed."""
+
+
 class PlacesConfig(StrictModel):
     """Places that are seen again."""
 
@@ -332,6 +339,7 @@ class Config(StrictModel):
     recovery: RecoveryConfig = RecoveryConfig()
     graph: GraphConfig = GraphConfig()
     linking: LinkingConfig = LinkingConfig()
+    atlas: AtlasConfig = AtlasConfig()
     places: PlacesConfig = PlacesConfig()
     loops: LoopsConfig = LoopsConfig()
     calibration: CalibrationConfig = CalibrationConfig()

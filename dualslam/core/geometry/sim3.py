@@ -113,6 +113,21 @@ def displacement(point: ArrayLike) -> FloatArray:
     return np.column_stack([-so3.hat(p), np.eye(3), p])
 
 
+def left_jacobian_inverse(xi: ArrayLike) -> FloatArray:
+    """Return the inverse of J with ``exp(xi + d) ~= exp(J d) exp(xi)``, (..., 7) -> (..., 7, 7).
+
+    J is the integral of ``Ad(exp(x xi))`` over x in [0, 1] (Sola et al., eq. (144) integrated), done by quadrature.
+    """
+    x = np.asarray(xi, np.float64)
+    Ad = adjoint(exp(_NODES[:, None] * x[..., None, :]))
+    return np.asarray(np.linalg.inv((_WEIGHTS[:, None, None] * Ad).sum(-3)), np.float64)
+
+
+def right_jacobian_inverse(xi: ArrayLike) -> FloatArray:
+    """Return the inverse of the right Jacobian, ``J_l(-xi)``."""
+    return left_jacobian_inverse(-np.asarray(xi, np.float64))
+
+
 def normalise(S: ArrayLike) -> FloatArray:
     """Return the similarity with its rotation made orthonormal again, (..., 4, 4)."""
     return from_parts(scale(S), so3.orthonormalise(rotation(S)), translation(S))
