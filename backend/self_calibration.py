@@ -19,7 +19,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
@@ -43,7 +43,6 @@ from dualslam.core.geometry import se3, so3
 from dualslam.core.geometry.umeyama import umeyama
 from dualslam.core.noise_model import INFLATION, PROOF_VIEWS
 from dualslam.core.types import Failure, FailureReason, FloatArray, IntArray
-from dualslam.map.lens import change_camera
 from dualslam.map.submap import Submap
 
 MAX_KEYFRAMES = 60
@@ -112,6 +111,7 @@ def calibrate_together(
     camera: Camera,
     present_covariance: FloatArray | None,
     *,
+    change_camera: Callable[[Submap, Camera], None],
     config: CalibrationConfig,
     robust_k: float = 1.345,
     seed: int = 0,
@@ -119,6 +119,7 @@ def calibrate_together(
     """Ask all maps of a run about their camera, together and whole, under a loss that forgets false matches.
 
     - `submaps`: are not changed. They have two keyframes or more.
+    - `change_camera`: gives a submap the pixels and the intrinsics of another camera.
     - `camera`, `config`, `robust_k`, `seed`, `present_covariance`: as for `estimate_calibration`.
 
     Returns the estimate, and copies of the submaps, changed to it. Earliest keyframe and unit of each are as before.

@@ -48,7 +48,7 @@ from dualslam.frontends.tracking.rolling_shutter import RollingShutter
 from dualslam.frontends.tracking.visual import VisualFrontEnd
 from dualslam.lab.disturbances import FaultScript
 from dualslam.map.graph_beside import BesideGraphs
-from dualslam.map.lens import Calibration
+from dualslam.map.lens import Calibration, change_camera
 from dualslam.map.submap import Submap
 from dualslam.map.submap_change import open_graph
 from dualslam.places.faiss_index import find_resembling
@@ -155,7 +155,11 @@ def build_system(
             new_relocaliser=faults.around_odometry(live.new_relocaliser),
             calibration=calibration,
             calibrate_together=partial(
-                calibrate_together, config=config.calibration, robust_k=config.graph.robust_k, seed=config.seed
+                calibrate_together,
+                change_camera=change_camera,
+                config=config.calibration,
+                robust_k=config.graph.robust_k,
+                seed=config.seed,
             ),
             shutter=shutter,
             scene=scene,

@@ -25,6 +25,7 @@ from dualslam.core.geometry import so3
 from dualslam.core.geometry.umeyama import umeyama
 from dualslam.core.types import Failure, FailureReason, FloatArray, Keyframe
 from dualslam.lab.metrics.alignment import distances_when_aligned
+from dualslam.map.lens import change_camera
 from dualslam.map.submap import Submap
 from dualslam.testing.graph_scene import make_features
 
@@ -90,7 +91,7 @@ class TestTogether:
         camera = wrong_camera()
         maps = [with_false_matches(make_submap(camera, turning=i < 2, seed=i), i) for i in range(3)]
         before = [submap.copy() for submap in maps]
-        found = calibrate_together(maps, camera, None, config=CONFIG)
+        found = calibrate_together(maps, camera, None, change_camera=change_camera, config=CONFIG)
         assert found
         estimate, changed = found
         assert estimate.accepted
@@ -118,7 +119,7 @@ class TestTogether:
         backwards = {k: maps[1].keyframes[k] for k in reversed(maps[1].keyframes)}  # as reverse tracking adds them
         maps[1].keyframes.clear()
         maps[1].keyframes.update(backwards)
-        found = calibrate_together(maps, camera, None, config=CONFIG)
+        found = calibrate_together(maps, camera, None, change_camera=change_camera, config=CONFIG)
         assert found
         for old, new in zip(maps, found[1], strict=True):
             errors = [
@@ -130,7 +131,11 @@ class TestTogether:
     def test_maps_without_turns_say_nothing(self) -> None:
         camera = wrong_camera()
         found = calibrate_together(
-            [make_submap(camera, turning=False, seed=i) for i in range(2)], camera, None, config=CONFIG
+            [make_submap(camera, turning=False, seed=i) for i in range(2)],
+            camera,
+            None,
+            change_camera=change_camera,
+            config=CONFIG,
         )
         assert isinstance(found, Failure)
         assert found.reason is FailureReason.DEGENERATE
