@@ -14,7 +14,7 @@ from dualslam.core.geometry.projection import project_points
 from dualslam.core.interfaces import Frontend
 from dualslam.core.matchers import CELLS, Sighting
 from dualslam.core.noise_model import MAJORITY, PROOF_VIEWS, TINY
-from dualslam.core.types import BoolArray, Features, FloatArray, IntArray
+from dualslam.core.types import BoolArray, Features, FloatArray, IntArray, Matches
 from dualslam.frontends.features.matching import FeatureGrid, match_projected
 from dualslam.map.submap import Submap
 
@@ -116,6 +116,34 @@ class LocalMap:
         octave = np.clip(np.rint(np.log(scale[ok]) / np.log(scale_factor)), 0, n_octaves - 1).astype(np.int64)
         return Prediction(rows[ok], uv.take(rows[ok], axis=0), octave)
 
+    def search(
+        self,
+        frontend: Frontend,
+        camera: Camera,
+        T_cam_submap: FloatArray,
+        K: FloatArray,
+        features: Features,
+        radius_px: float,
+        max_distance: float | None = None,
+    ) -> tuple[Prediction, Matches]:
+        """Look for the landmarks in an image, so far at most from where they should be seen under a pose.
+
+        - `radius_px`: at octave 0.
+
+        Returns what should be seen, and matches: rows of that, and features.
+        """
+        seen = self.predict(T_cam_submap, K, camera, frontend.scale_factor, frontend.n_octaves)
+        return seen, match_projected(
+            frontend,
+            FeatureGrid.build(features.uv_rect_px),
+            features,
+            seen.uv_px,
+            radius_px * frontend.scale_factor**seen.octave,
+            self.descriptors[seen.rows],
+            octave=seen.octave,
+            max_distance=max_distance,
+        )
+
 
 def trusted(submap: Submap, ids: IntArray, T_cam_submap: FloatArray, min_inliers: int) -> BoolArray:
     """Return which landmarks a pose is estimated from: not unproven ones right before the camera."""
@@ -154,18 +182,8 @@ def look(
 ) -> Sighting:
     """Look for landmarks of a submap in an image, about where they should be under a pose: see `Look`."""
     local = LocalMap.of_landmarks(submap, landmark_ids)
-    seen = local.predict(T_cam_submap, K, camera, frontend.scale_factor, frontend.n_octaves)
+    seen, matches = local.search(frontend, camera, T_cam_submap, K, features, radius_px)
     feature = np.full(len(seen.rows), -1, np.int64)
-    if len(features) and len(seen.rows):
-        matches = match_projected(
-            frontend,
-            FeatureGrid.build(features.uv_rect_px),
-            features,
-            seen.uv_px,
-            radius_px * frontend.scale_factor**seen.octave,
-            local.descriptors[seen.rows],
-            octave=seen.octave,
-        )
-        feature[matches.index[:, 0]] = matches.index[:, 1]
+    feature[matches.index[:, 0]] = matches.index[:, 1]
     part = np.clip(camera.unrectify(seen.uv_px) / camera.size_px * CELLS, 0, CELLS - 1).astype(np.int64)
     return Sighting(local.landmark_ids[seen.rows], feature, CELLS * part[:, 1] + part[:, 0])

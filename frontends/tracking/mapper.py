@@ -16,7 +16,7 @@ from dualslam.core.geometry.two_view import fundamental_from_pose
 from dualslam.core.interfaces import Frontend
 from dualslam.core.noise_model import CELLS_ACROSS, COVISIBLE, PROOF_VIEWS, SAME_POINT_PX, TINY
 from dualslam.core.types import BoolArray, Features, FloatArray, IntArray, Keyframe, Track
-from dualslam.frontends.features.matching import FeatureGrid, match_epipolar, match_projected
+from dualslam.frontends.features.matching import match_epipolar
 from dualslam.frontends.tracking.local_map import LocalMap
 from dualslam.map.submap import NO_LANDMARK, Submap
 
@@ -147,18 +147,9 @@ class Mapper:
         """Search landmarks in a keyframe; a free feature becomes an observation, a taken one a pair to merge."""
         submap, frontend = self._submap, self._frontend
         features = submap.keyframes[k].features
-        prediction = local.predict(
-            se3.inverse(submap.T_submap_kf[k]), submap.K, self._camera, frontend.scale_factor, frontend.n_octaves
-        )
-        matches = match_projected(
-            frontend,
-            FeatureGrid.build(features.uv_rect_px),
-            features,
-            prediction.uv_px,
-            SAME_POINT_PX * frontend.scale_factor**prediction.octave,
-            local.descriptors[prediction.rows],
-            octave=prediction.octave,
-            max_distance=frontend.max_distance_strict,
+        T_kf_submap = se3.inverse(submap.T_submap_kf[k])
+        prediction, matches = local.search(
+            frontend, self._camera, T_kf_submap, submap.K, features, SAME_POINT_PX, frontend.max_distance_strict
         )
         row, feature = matches.index[:, 0], matches.index[:, 1]
         error = (features.uv_rect_px[feature] - prediction.uv_px[row]) / features.sigma_px[feature][:, None]
