@@ -152,14 +152,14 @@ class Calibration:
         A camera that an answer of twice the information does not change is confirmed. Nothing more is asked until all
         maps are asked together.
         """
-        asked, sigma = job.submap.id, self.log_focal_sigma
+        asked = job.submap.id
         self.note_change(failure)
         if failure.numbers:
             self._estimated.add(asked)
         if failure.reason is FailureReason.DEGENERATE:
             self._said_nothing(asked, len(job.submap.keyframes))
-        elif failure.reason is FailureReason.CHI_SQUARE and asked == self._refined_in and sigma is not None:
-            self._is_confirmed = failure.numbers["log_focal_sigma"] < UPDATE_SIGMA_RATIO * sigma
+        elif failure.reason is FailureReason.CHI_SQUARE and asked == self._refined_in:
+            self._is_confirmed = self._knows_twice_as_much(failure.numbers["log_focal_sigma"])
 
     def note_change(self, found: CalibrationEstimate | Failure) -> None:
         """Note by how much an answer that was not taken would change the path."""
@@ -172,8 +172,7 @@ class Calibration:
 
     def take_together(self, estimate: CalibrationEstimate) -> bool:
         """Take what all maps of a run say together, if it is significant or has twice the information; say whether."""
-        present, found = self.log_focal_sigma, float(np.sqrt(estimate.covariance[0, 0]))
-        taken = estimate.accepted or (present is not None and found < UPDATE_SIGMA_RATIO * present)
+        taken = estimate.accepted or self._knows_twice_as_much(float(np.sqrt(estimate.covariance[0, 0])))
         if taken:
             self._camera, self._covariance = correct(self._camera, estimate.correction), estimate.covariance
         return taken
@@ -234,11 +233,14 @@ class Calibration:
 
     def _is_much_surer(self, covariance: FloatArray) -> bool:
         """Whether an answer is worth a change that is not significant: only where the present one was hardly sure."""
-        config, present, found = self._config, self.log_focal_sigma, float(np.sqrt(covariance[0, 0]))
-        if present is None:
-            return False
-        hardly_sure = present > min(config.max_focal_sigma, SURE_SIGMA)
-        return hardly_sure and found < UPDATE_SIGMA_RATIO * present
+        sure = min(self._config.max_focal_sigma, SURE_SIGMA)
+        hardly_sure = self.log_focal_sigma is not None and self.log_focal_sigma > sure
+        return hardly_sure and self._knows_twice_as_much(float(np.sqrt(covariance[0, 0])))
+
+    def _knows_twice_as_much(self, log_focal_sigma: float) -> bool:
+        """Whether an answer has twice the information of the one in use; not where that is the given camera."""
+        present = self.log_focal_sigma
+        return present is not None and log_focal_sigma < UPDATE_SIGMA_RATIO * present
 
     def rectified(self, view: View) -> View:
         """Return a view with the pixels of the present camera; features without a place there keep their old one."""

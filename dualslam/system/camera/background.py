@@ -96,9 +96,7 @@ class Calibrations:
             estimate, changed = found
             rectified = partial(rectified_where_possible, camera=calibration.camera)
             for submap, after in zip(submaps, changed, strict=True):
-                before = submap.copy()
-                submap.take_over(after)
-                self._connections.follow(before, submap, now)
+                self._change(submap, after, now)
                 self._record.change_pixels(submap.id, lambda _: rectified)
         self._record.event(EventKind.CALIBRATED, now, lost=[], **estimate.numbers)
 
@@ -175,10 +173,14 @@ class Calibrations:
         except InputError as error:
             log.warning("submap %d keeps its camera: %s", submap_id, error)
             return False
-        before = submap.copy()
-        submap.take_over(merged)
-        self._connections.follow(before, submap, now)
+        self._change(submap, merged, now)
         return True
+
+    def _change(self, submap: Submap, changed: Submap, now: FrameStamp) -> None:
+        """Let a submap become what a copy of it was changed to, and all that hangs on it follow."""
+        before = submap.copy()
+        submap.take_over(changed)
+        self._connections.follow(before, submap, now)
 
 
 def merge_calibrated(live: Submap, base: Submap, answer: CalibrationAnswer) -> Submap:
