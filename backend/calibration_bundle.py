@@ -19,7 +19,7 @@ from dualslam.core.errors import SolverError
 from dualslam.core.noise_model import MAX_TRIES, MIN_DEPTH_MU, TINY
 from dualslam.core.types import FloatArray
 
-MAX_ITERATIONS, TOLERANCE = 100, 1e-5
+MAX_ITERATIONS = 100
 """Most need a few. Where the focal length is far off, the way is long and bent: lens and focal length make up for each
 other."""
 
@@ -87,16 +87,19 @@ class _HeldLens(CorrectedLens):
         return by_ray, by_lens[:, :, :0]
 
 
-def optimise_with_camera(problem: BundleProblem, start: FloatArray, prior: FloatArray, loss: Loss) -> CalibratedOptimum:
+def optimise_with_camera(
+    problem: BundleProblem, start: FloatArray, prior: FloatArray, loss: Loss, tolerance: float
+) -> CalibratedOptimum:
     """Minimise over poses, points and correction, without the few points that end behind a camera.
 
     - `problem`: in the rectified pixels of the camera as it was given; of each map the first pose is fixed.
     - `start`, `prior` (5,): the correction to begin at, and the prior sigmas of its parts about zero.
+    - `tolerance`: relative decrease of the cost below which to stop.
 
     Raises `SolverError` if there is no optimum, or nothing fixes the correction.
     """
     lens = CorrectedLens(problem.K, np.diag(prior**-2.0))
-    kept, found = _in_front(problem, loss, lens, start)
+    kept, found = _in_front(problem, loss, tolerance, lens, start)
     state = _in_unit_of(kept, problem, found.state)
     return CalibratedOptimum(
         state.T_submap_kf,
@@ -105,22 +108,24 @@ def optimise_with_camera(problem: BundleProblem, start: FloatArray, prior: Float
         noise_ratio(kept, state),
         found.cost_before,
         found.cost_after,
-        partial(_poses_under, replace(kept, T_submap_kf=state.T_submap_kf, xyz_mu=state.xyz_mu), loss),
+        partial(_poses_under, replace(kept, T_submap_kf=state.T_submap_kf, xyz_mu=state.xyz_mu), loss, tolerance),
     )
 
 
-def _poses_under(problem: BundleProblem, loss: Loss, correction: FloatArray) -> FloatArray:
+def _poses_under(problem: BundleProblem, loss: Loss, tolerance: float, correction: FloatArray) -> FloatArray:
     """Return the poses (K, 4, 4) at which the cost is least, were the camera another one."""
     lens = _HeldLens(problem.K, correction)
-    kept, found = _in_front(problem, loss, lens, np.zeros(0))
+    kept, found = _in_front(problem, loss, tolerance, lens, np.zeros(0))
     return _in_unit_of(kept, problem, found.state).T_submap_kf
 
 
-def _in_front(problem: BundleProblem, loss: Loss, lens: Lens, start: FloatArray) -> tuple[BundleProblem, Optimum]:
+def _in_front(
+    problem: BundleProblem, loss: Loss, tolerance: float, lens: Lens, start: FloatArray
+) -> tuple[BundleProblem, Optimum]:
     """Minimise, and again without the points that are behind a camera; return what is left, and its optimum."""
     p = problem
     for _ in range(MAX_TRIES + 1):
-        found = optimise(p, loss, MAX_ITERATIONS, TOLERANCE, lens, start)
+        found = optimise(p, loss, MAX_ITERATIONS, tolerance, lens, start)
         T, xyz = found.state.T_submap_kf, found.state.xyz_mu
         depth = np.einsum("ri,ri->r", T[p.kf, :3, 2], xyz[p.point] - T[p.kf, :3, 3])
         behind = np.unique(p.point[depth <= MIN_DEPTH_MU])
