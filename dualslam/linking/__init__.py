@@ -5,11 +5,10 @@ In reading order:
 - `correspondences`: which landmarks are the same,
 - `estimate`: the decision, step by step,
 - `timeline`: what the keyframes say one by one, in order of time,
-- `deformation`: how the maps are bent beyond a similarity,
 - `join_test`: the gates of all joins, and `verify`: what they ask of a link,
 - `live_end` propagates the link's covariance to the current frame: by the walk's loss of scale, and the camera's error,
 - `pairs`: the matches as measurements, `scale_observability`: how firmly a map holds its scale,
-- `motion`: the camera's motion across gaps and seams. `link_tries`: earlier tries.
+- `motion`: the camera's motion across gaps and seams.
 """
 
 from dualslam.linking.correspondences import Correspondences, DescriptorMatcher, propose_correspondences

@@ -71,7 +71,7 @@ def plausible(record: Record, match: PlaceMatch) -> PlaceMatch | Failure:
 
 
 def reachable(record: Record, match: PlaceMatch) -> PlaceMatch | Failure:
-    """Refuse to join two maps of this run where the camera cannot have come from one to the other (`recovery/motion`).
+    """Refuse to join two maps of this run where the camera cannot have come from one to the other (`linking/motion`).
 
     The maps are joined with all that each is linked with. Between the place and the seam both may have drifted.
     """
