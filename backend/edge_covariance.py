@@ -19,6 +19,7 @@ from dualslam.core.errors import SolverError
 from dualslam.core.geometry import se3, sim3, so3
 from dualslam.core.noise_model import MIN_DEPTH_MU
 from dualslam.core.types import FloatArray, IntArray
+from dualslam.map.anchors import add_relative_poses
 from dualslam.map.submap import Submap
 
 BESIDE = 3
@@ -76,7 +77,8 @@ def _covariance(
     own = np.zeros((n, se3.DOF, se3.DOF))
     np.add.at(own, kf, J_pose.transpose(0, 2, 1) @ J_pose)
     information[np.arange(n), :, np.arange(n), :] += own
-    _add_relative_poses(information, submap, window, held)
+    relative = {k: known for k, known in submap.relative_poses.items() if k not in held}
+    add_relative_poses(information, window, submap.T_submap_kf, relative)
     n_points = int(point.max()) + 1 if len(point) else 0
     H_points = np.zeros((n_points, 3, 3))
     np.add.at(H_points, point, J_point.transpose(0, 2, 1) @ J_point)
@@ -159,18 +161,3 @@ def _unit(
     own = np.concatenate((so3.hat(x)[:, 2], np.broadcast_to([0.0, 0.0, -1.0], x.shape)), axis=1)
     derivative[se3.DOF * c : se3.DOF * c + se3.DOF] += (own / x[:, 2:]).mean(0)
     return derivative
-
-
-def _add_relative_poses(information: FloatArray, submap: Submap, window: IntArray, held: frozenset[int]) -> None:
-    """Add what another front end says of keyframes across a gap relocalisation."""
-    place = {k: i for i, k in enumerate(window.tolist())}
-    for k, known in submap.relative_poses.items():
-        if k in held or k not in place or known.keyframe_id not in place:
-            continue
-        i, j = place[known.keyframe_id], place[k]
-        T_k_ref = se3.inverse(submap.T_submap_kf[k]) @ submap.T_submap_kf[known.keyframe_id]
-        W, Ad = np.linalg.inv(known.covariance), se3.adjoint(T_k_ref)
-        information[j, :, j, :] += W
-        information[i, :, i, :] += Ad.T @ W @ Ad
-        information[i, :, j, :] -= Ad.T @ W
-        information[j, :, i, :] -= W @ Ad

@@ -24,6 +24,17 @@ def is_first(values: IntArray) -> BoolArray:
     return first
 
 
+def first_in_both(a: IntArray, b: IntArray) -> IntArray:
+    """Return rows of a greedy one-to-one selection of pairs (a, b) that stand in order of preference."""
+    rows = np.arange(len(a))
+    kept: list[IntArray] = []
+    while len(rows):
+        chosen = rows[is_first(a[rows]) & is_first(b[rows])]
+        kept.append(chosen)
+        rows = rows[~np.isin(a[rows], a[chosen]) & ~np.isin(b[rows], b[chosen])]
+    return np.sort(np.concatenate(kept)) if kept else rows
+
+
 def rank_in_runs(group: IntArray) -> IntArray:
     """Place of each row in its run of equal values, from 0: sorted by group and cost, that is the rank in the group."""
     place = np.arange(len(group))

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from dualslam.core.arrays import concatenate, is_first
+from dualslam.core.arrays import concatenate, first_in_both
 from dualslam.core.types import BoolArray, Features, FloatArray, IntArray
 from dualslam.map.landmark_views import landmark_covariances, triangulate_landmarks
 from dualslam.map.submap import NO_LANDMARK, Submap
@@ -183,7 +183,7 @@ def _match_near(a: Features, b: Features, matcher: DescriptorMatcher) -> tuple[I
     np.minimum.at(best_b, j, d)
     mutual = np.flatnonzero((d <= best_a[i]) & (d <= best_b[j]) & (d <= matcher.max_distance))
     mutual = mutual[np.lexsort((apart2[mutual], d[mutual]))]  # equal descriptors: the nearer pixels
-    keep = _first_in_both(i[mutual], j[mutual])
+    keep = first_in_both(i[mutual], j[mutual])
     return i[mutual[keep]], j[mutual[keep]], d[mutual[keep]]
 
 
@@ -198,17 +198,6 @@ def _near_columns(a: FloatArray, b: FloatArray, radius: float) -> tuple[IntArray
     return i, j[ascending]
 
 
-def _first_in_both(a: IntArray, b: IntArray) -> IntArray:
-    """Return rows of a greedy one-to-one selection of pairs (a, b) that stand in order of preference."""
-    rows = np.arange(len(a))
-    kept: list[IntArray] = []
-    while len(rows):
-        chosen = rows[is_first(a[rows]) & is_first(b[rows])]
-        kept.append(chosen)
-        rows = rows[~np.isin(a[rows], a[chosen]) & ~np.isin(b[rows], b[chosen])]
-    return np.sort(np.concatenate(kept)) if kept else rows
-
-
 def _one_to_one(votes: _Votes, n_new: int) -> tuple[tuple[IntArray, IntArray], IntArray]:
     """Merge votes into pairs: ((landmark_old, landmark_new), pair of each vote or -1 where the pair was not kept)."""
     key = votes.landmark_old * max(n_new, 1) + votes.landmark_new
@@ -219,7 +208,7 @@ def _one_to_one(votes: _Votes, n_new: int) -> tuple[tuple[IntArray, IntArray], I
     np.minimum.at(distance, inverse, votes.distance)
     order = np.lexsort((unique, distance, -n_votes, -n_identical))
     a, b = unique // max(n_new, 1), unique % max(n_new, 1)
-    kept = np.sort(order[_first_in_both(a[order], b[order])])
+    kept = np.sort(order[first_in_both(a[order], b[order])])
     row = np.full(len(unique), -1)
     row[kept] = np.arange(len(kept))
     return (a[kept], b[kept]), row[inverse]

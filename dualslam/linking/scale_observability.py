@@ -76,8 +76,7 @@ def relative_scales(
     - `stretches`, `places`: keyframe ids of each; two at least in a stretch.
     - `excess`: of `noise_excess`.
     """
-    ids, n = np.array(sorted(submap.keyframes), np.int64), len(stretches) + len(places)
-    problem = _linearise(_ask_all(submap, [(ids, ids)], excess))
+    problem, n = normal_equations(submap, excess), len(stretches) + len(places)
     if problem is None:
         return np.where(np.eye(n, dtype=bool), 0.0, np.inf)
     free, root = _directions(problem.reduced)
@@ -97,7 +96,7 @@ def position_sigmas(submap: Submap, held: Collection[int]) -> dict[int, float]:
     Infinite where nothing ties it to them.
     """
     ids = np.array(sorted(submap.keyframes), np.int64)
-    problem = _linearise(_ask_all(submap, [(ids, ids)], dict.fromkeys(submap.keyframes, 1.0)))
+    problem = normal_equations(submap, dict.fromkeys(submap.keyframes, 1.0))
     free = ids[~np.isin(ids, list(held))]
     sigma = dict.fromkeys(submap.keyframes, 0.0) | dict.fromkeys(free.tolist(), np.inf)
     if problem is None or not len(free):
@@ -109,6 +108,15 @@ def position_sigmas(submap: Submap, held: Collection[int]) -> dict[int, float]:
     variance = (by_place[:, :, stiff] ** 2 / values[stiff]).sum(axis=(1, 2))
     tied = (by_place[:, :, ~stiff] ** 2).sum(axis=(1, 2)) <= SLACK
     return sigma | dict(zip(free[tied].tolist(), np.sqrt(variance[tied]).tolist(), strict=True))
+
+
+def normal_equations(submap: Submap, excess: Mapping[int, float]) -> NormalEquations | None:
+    """Return those of all keyframes, and of the landmarks that two of them see, if there are any.
+
+    `excess`: of `noise_excess`.
+    """
+    ids = np.array(sorted(submap.keyframes), np.int64)
+    return _linearise(_ask_all(submap, [(ids, ids)], excess))
 
 
 def _ask_all(submap: Submap, places: Sequence[tuple[IntArray, IntArray]], excess: Mapping[int, float]) -> ScaleQuestion:
@@ -126,6 +134,7 @@ class ScaleQuestion:
     K: FloatArray  # (3, 3)
     ids: IntArray  # (F,): keyframes that count; none where there is no place
     T_submap_kf: FloatArray  # (F, 4, 4)
+    landmarks: IntArray  # (N,): ids, ascending
     xyz: FloatArray  # (N, 3)
     # Rows of `ids` and `xyz` of each observation.
     kf: IntArray  # (R,)
@@ -152,7 +161,7 @@ def ask_scale(submap: Submap, places: Sequence[tuple[IntArray, IntArray]], n_aro
     uv, sigma = submap.observed_pixels(rows)
     landmarks, point = np.unique(obs["landmark"][rows], return_inverse=True)
     kf, xyz = np.searchsorted(ids, obs["kf"][rows]), submap.landmarks["xyz_mu"][landmarks]
-    return ScaleQuestion(pairs, submap.K, ids, submap.keyframe_poses(ids), xyz, kf, point, uv, sigma)
+    return ScaleQuestion(pairs, submap.K, ids, submap.keyframe_poses(ids), landmarks, xyz, kf, point, uv, sigma)
 
 
 def answer_scale(question: ScaleQuestion) -> list[float]:
@@ -174,7 +183,7 @@ def _directions(reduced: FloatArray) -> tuple[FloatArray, FloatArray]:
     return vectors[:, ~stiff], vectors[:, stiff] / np.sqrt(values[N_GAUGE:][stiff])
 
 
-def _sigma(problem: _Problem, free: FloatArray, root: FloatArray, here: IntArray, there: IntArray) -> float:
+def _sigma(problem: NormalEquations, free: FloatArray, root: FloatArray, here: IntArray, there: IntArray) -> float:
     """Ask the normal equations, with their `_directions`, for one pair of places."""
     g = [_scale_at(problem, ids) for ids in (there, here)]
     if g[0] is None or g[1] is None:
@@ -189,11 +198,12 @@ def _sigma(problem: _Problem, free: FloatArray, root: FloatArray, here: IntArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Problem:
+class NormalEquations:
     """The normal equations of F keyframes and N points, the points' blocks inverted."""
 
     ids: IntArray  # (F,)
     T_cam_submap: FloatArray  # (F, 4, 4)
+    landmarks: IntArray  # (N,): ids, ascending
     xyz: FloatArray  # (N, 3)
     # Rows of each observation.
     kf: IntArray  # (R,)
@@ -203,7 +213,7 @@ class _Problem:
     reduced: FloatArray  # (6 F, 6 F): of the poses, the points eliminated
 
 
-def _linearise(question: ScaleQuestion) -> _Problem | None:
+def _linearise(question: ScaleQuestion) -> NormalEquations | None:
     """Return the normal equations; none where no point is seen twice."""
     q = question
     T, ids = se3.inverse(q.T_submap_kf), q.ids
@@ -238,10 +248,11 @@ def _linearise(question: ScaleQuestion) -> _Problem | None:
     reduced = -np.asarray((through @ H_cross.T).toarray())
     for f in range(n_f):
         reduced[6 * f : 6 * f + 6, 6 * f : 6 * f + 6] += H_pose[f]
-    return _Problem(ids, T, q.xyz[points], kf, point, inverse, H_cross, (reduced + reduced.T) / 2)
+    reduced = (reduced + reduced.T) / 2
+    return NormalEquations(ids, T, q.landmarks[points], q.xyz[points], kf, point, inverse, H_cross, reduced)
 
 
-def _scale_at(problem: _Problem, ids: IntArray) -> tuple[FloatArray, FloatArray] | None:
+def _scale_at(problem: NormalEquations, ids: IntArray) -> tuple[FloatArray, FloatArray] | None:
     """Return the derivative of the mean log depth that some keyframes see: by the poses (6 F,), the points (N, 3).
 
     A point counts by how well its own depth is known where the poses are.
@@ -261,13 +272,13 @@ def _scale_at(problem: _Problem, ids: IntArray) -> tuple[FloatArray, FloatArray]
     return g_pose.reshape(-1), g_point
 
 
-def _by_poses(problem: _Problem, g_pose: FloatArray, g_point: FloatArray) -> FloatArray:
+def _by_poses(problem: NormalEquations, g_pose: FloatArray, g_point: FloatArray) -> FloatArray:
     """Return a functional's derivative by the poses (6 F,) when the points follow them."""
     follows = np.einsum("nij,nj->ni", problem.inverse, g_point)
     return np.asarray(g_pose - problem.H_cross @ follows.reshape(-1), np.float64)
 
 
-def _firmness(problem: _Problem) -> FloatArray:
+def _firmness(problem: NormalEquations) -> FloatArray:
     """Return the inverse variance (F,) of each keyframe's position where the others are."""
     n = len(problem.ids)
     H = problem.reduced.reshape(n, 6, n, 6)[np.arange(n), :, np.arange(n)]
@@ -275,7 +286,7 @@ def _firmness(problem: _Problem) -> FloatArray:
     return np.asarray(1.0 / np.trace(np.linalg.inv(H)[:, 3:, 3:], axis1=1, axis2=2), np.float64)
 
 
-def _size_at(problem: _Problem, ids: IntArray, weight: FloatArray) -> FloatArray:
+def _size_at(problem: NormalEquations, ids: IntArray, weight: FloatArray) -> FloatArray:
     """Return the derivative (6 F,) of the log of the path's size at some keyframes by the poses."""
     rows = np.searchsorted(problem.ids, ids)
     T, share = problem.T_cam_submap[rows], weight[rows, None] / weight[rows].sum()

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
 from dualslam.core.geometry import se3
-from dualslam.core.types import FloatArray
+from dualslam.core.types import FloatArray, IntArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -36,3 +37,20 @@ class RelativePose:
     def seen_from(self, keyframe_id: int, T_kf_ref: FloatArray) -> RelativePose:
         """Return the same relative to another keyframe, of which the old one's place is known."""
         return RelativePose(keyframe_id, T_kf_ref @ self.T_ref_kf, self.covariance)
+
+
+def add_relative_poses(
+    information: FloatArray, kf: IntArray, T_submap_kf: Mapping[int, FloatArray], relative: Mapping[int, RelativePose]
+) -> None:
+    """Add what relative poses say of keyframes (n,) to the information (n, 6, n, 6) of their right perturbations."""
+    place = {k: i for i, k in enumerate(kf.tolist())}
+    for k, known in relative.items():
+        if k not in place or known.keyframe_id not in place:
+            continue
+        i, j = place[known.keyframe_id], place[k]
+        T_k_ref = se3.inverse(T_submap_kf[k]) @ T_submap_kf[known.keyframe_id]
+        W, Ad = np.linalg.inv(known.covariance), se3.adjoint(T_k_ref)
+        information[j, :, j, :] += W
+        information[i, :, i, :] += Ad.T @ W @ Ad
+        information[i, :, j, :] -= Ad.T @ W
+        information[j, :, i, :] -= W @ Ad

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
 
+from dualslam.core.arrays import first_in_both
 from dualslam.core.geometry import se3, sim3, so3
 from dualslam.core.geometry.alignment import estimate_sim3_robust
 from dualslam.core.interfaces import Frontend
@@ -92,17 +93,8 @@ def one_to_one(votes: list[tuple[IntArray, IntArray]]) -> tuple[IntArray, IntArr
     """Return pairs of landmarks of which either is the other's most frequent partner, ascending."""
     a, b = (np.concatenate([np.zeros(0, np.int64), *column]) for column in zip(*votes, strict=True))
     pairs, n = np.unique(np.stack([a, b], 1), axis=0, return_counts=True)
-    order = np.lexsort((pairs[:, 1], pairs[:, 0], -n))
-    taken_a: set[int] = set()
-    taken_b: set[int] = set()
-    kept = []
-    for row in order.tolist():
-        i, j = pairs[row].tolist()
-        if i not in taken_a and j not in taken_b:
-            taken_a.add(i)
-            taken_b.add(j)
-            kept.append(row)
-    chosen = pairs[sorted(kept)]
+    order = np.argsort(-n, kind="stable")
+    chosen = pairs[np.sort(order[first_in_both(*pairs[order].T)])]
     return chosen[:, 0], chosen[:, 1]
 
 
