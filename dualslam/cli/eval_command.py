@@ -10,18 +10,18 @@ from typing import Any
 import numpy as np
 
 from dualslam.core.errors import InputError
+from dualslam.core.interfaces import Sequence
 from dualslam.core.types import FloatArray
+from dualslam.io.bags import has_topics
+from dualslam.io.colours import load_pictures
 from dualslam.io.map_files import to_plain
 from dualslam.io.map_store import load_atlas
-from dualslam.io.run_folder import FRAMES, SUMMARY, TRAJECTORY
+from dualslam.io.run_folder import FRAMES, MAP, SUMMARY, TRAJECTORY
 from dualslam.io.run_reading import read_frames, read_numbers, read_summary
 from dualslam.io.trajectory_files import read_tum
 from dualslam.io.video import is_live
 from dualslam.lab.metrics.trajectory_metrics import end_to_start, evaluate_run
 from dualslam.run.sources import ANY_FOV_DEG, SYNTHETIC, open_images_of_run, open_source
-
-MAX_GREY_LEVELS = 5.0
-"""Mean difference between two copies of an image, one of them compressed again."""
 
 
 def execute(args: argparse.Namespace) -> int:
@@ -30,10 +30,7 @@ def execute(args: argparse.Namespace) -> int:
         raise InputError(f"{args.run} does not exist; give a run folder or a trajectory.")
     if is_live(args.sequence):
         raise InputError(f"{args.sequence} is live: it has no ground truth.")
-    # No camera is asked for a score: a sequence without a calibration has times and true poses all the same.
-    fov_degrees = None if args.sequence.startswith(SYNTHETIC) else ANY_FOV_DEG
-    sequence = open_source(args.sequence, fov_degrees=fov_degrees, time_unit=args.time_unit, **_selection(args.run))
-    _refuse_other_images(args.run, args.sequence)
+    sequence = _open(args)
     times_s = _keyframe_times(args.run) if args.keyframes_only else None
     score: dict[str, Any] = {}
     if not args.returns or getattr(sequence, "ground_truth", None) is not None:
@@ -62,28 +59,19 @@ def score_text(score: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def _selection(run: Path) -> dict[str, Any]:
-    """Return which frames of the source a run was made of; all where it does not say so."""
-    selection = read_summary(run).get("selection") if (run / SUMMARY).is_file() else None
-    return selection or {}
-
-
-def _refuse_other_images(run: Path, sequence: str) -> None:
-    """Refuse a sequence of other images: many have the same times. Says nothing where the run's source has gone."""
+def _open(args: argparse.Namespace) -> Sequence:
+    """Open the frames of the sequence that a run took. Refuse other images: many have the same times."""
+    run, sequence = args.run, args.sequence
     summary = read_summary(run) if (run / SUMMARY).is_file() else {}
-    source, camera = summary.get("source"), summary.get("camera") or {}
-    if (
-        not source
-        or source in (sequence, str(Path(sequence).resolve()))
-        or not (":" in source or Path(source).exists())
-    ):
-        return
-    size_px = camera.get("width", 0), camera.get("height", 0)
-    index = summary.get("first_index") or 0
-    frames = [next(iter(open_images_of_run(each, size_px).in_colour([index])), None) for each in (source, sequence)]
-    a, b = (None if f is None or f.image is None else f.image.reshape(*f.image.shape[:2], -1).mean(-1) for f in frames)
-    if a is not None and b is not None and np.abs(a - b).mean() > MAX_GREY_LEVELS:
-        raise InputError(f"{run} was made of {source}, and {sequence} shows other images; give the same sequence.")
+    camera, pictures = summary.get("camera") or {}, load_pictures(run / MAP)
+    topic = summary.get("topic") if has_topics(Path(sequence)) else None
+    # No camera is asked for a score: a sequence without a calibration has times and true poses all the same.
+    fov_degrees = None if sequence.startswith(SYNTHETIC) else ANY_FOV_DEG
+    chosen = summary.get("selection") or {}
+    opened = open_source(sequence, fov_degrees=fov_degrees, time_unit=args.time_unit, topic=topic, **chosen)
+    if pictures and summary.get("source") not in (sequence, str(Path(sequence).resolve())):
+        open_images_of_run(sequence, (camera["width"], camera["height"]), topic, pictures)
+    return opened
 
 
 def _keyframe_times(run: Path) -> FloatArray:

@@ -108,7 +108,7 @@ def _of_mapping(content: dict[str, Any], where: str, images_px: Callable[[], Siz
         content = with_y_down(content, where)
     camera = make_camera(where, lambda: camera_from_dict(content))
     # What one run has found is what another is given: that may correct it once more, and not take this correction off.
-    return CorrectedCamera.of(camera, LensCorrection()) if isinstance(camera, CorrectedCamera) else camera
+    return CorrectedCamera.over(camera, LensCorrection()) if isinstance(camera, CorrectedCamera) else camera
 
 
 # --- COLMAP

@@ -133,7 +133,7 @@ def zoomed(camera: Camera, log_zoom: float) -> Camera:
         return zoomed(camera.base, log_zoom)
     if isinstance(camera, CorrectedCamera):
         correction = replace(camera.correction, log_focal=camera.correction.log_focal + log_zoom)
-        return CorrectedCamera.of(camera.base, correction)
+        return CorrectedCamera.over(camera.base, correction)
     factor = math.exp(log_zoom)
     return replace(camera, fx=camera.fx * factor, fy=camera.fy * factor)
 

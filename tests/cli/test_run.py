@@ -32,6 +32,7 @@ from dualslam.run.session import run_to_folder
 from dualslam.run.sources import open_source
 from tests.cli.conftest import N_FRAMES
 from tests.cli.fakes import FakeSystem
+from tests.io.test_bags import Writer, rgb_of, write_bag
 
 Install = Callable[..., None]
 
@@ -494,6 +495,17 @@ def test_eval_needs_no_calibration(
     for sequence, words in ((str(bare), "bare has no ground truth"), ("0", "0 is live: it has no ground truth")):
         assert main(["eval", str(run), sequence]) == 2
         assert words in capsys.readouterr().err
+
+
+def test_eval_reads_the_topic_that_the_run_has_read(fake: Install, tmp_path: Path) -> None:
+    def fill(writer: Writer) -> None:
+        for i in range(N_FRAMES):
+            writer.image("/left/image_raw", i, rgb_of(i), "rgb8")
+            writer.image("/right/image_raw", i, rgb_of(i), "rgb8")
+
+    bag, run = str(write_bag(tmp_path / "drive", "mcap", fill)), str(tmp_path / "run")
+    assert main(["run", bag, "--topic", "/left/image_raw", "--fov", "60", "--out", run, "--quiet"]) == 0
+    assert main(["eval", run, bag, "--returns"]) == 0
 
 
 def test_render_writes_a_sequence_and_overwrites_only_its_own(

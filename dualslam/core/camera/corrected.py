@@ -80,14 +80,6 @@ class CorrectedCamera(LayeredCamera):
 
     correction: LensCorrection = LensCorrection()
 
-    @classmethod
-    def of(cls, base: Camera, correction: LensCorrection) -> CorrectedCamera:
-        """Correct a camera.
-
-        Raises `InputError` if the correction has no inverse somewhere in the image.
-        """
-        return cls.over(base, correction)
-
     @property
     def K(self) -> FloatArray:
         """(3, 3) intrinsics of the rectified pixels."""
@@ -160,8 +152,11 @@ class CorrectedCamera(LayeredCamera):
 
 
 def correct(camera: Camera, correction: LensCorrection) -> CorrectedCamera:
-    """Return `camera` with a correction to the calibration that was given (one that it has already is replaced)."""
-    return CorrectedCamera.of(given_camera(camera), correction)
+    """Return `camera` with a correction to the calibration that was given (one that it has already is replaced).
+
+    Raises `InputError` if the correction has no inverse somewhere in the image.
+    """
+    return CorrectedCamera.over(given_camera(camera), correction)
 
 
 def given_camera(camera: Camera) -> Camera:
