@@ -45,12 +45,11 @@ def add_relative_poses(
     """Add what relative poses say of keyframes (n,) to the information (n, 6, n, 6) of their right perturbations."""
     place = {k: i for i, k in enumerate(kf.tolist())}
     for k, known in relative.items():
-        if k not in place or known.keyframe_id not in place:
-            continue
-        i, j = place[known.keyframe_id], place[k]
-        T_k_ref = se3.inverse(T_submap_kf[k]) @ T_submap_kf[known.keyframe_id]
-        W, Ad = np.linalg.inv(known.covariance), se3.adjoint(T_k_ref)
-        information[j, :, j, :] += W
-        information[i, :, i, :] += Ad.T @ W @ Ad
-        information[i, :, j, :] -= Ad.T @ W
-        information[j, :, i, :] -= W @ Ad
+        if k in place and known.keyframe_id in place:
+            i, j = place[known.keyframe_id], place[k]
+            W = np.linalg.inv(known.covariance)
+            Ad = se3.adjoint(se3.inverse(T_submap_kf[k]) @ T_submap_kf[known.keyframe_id])
+            information[j, :, j, :] += W
+            information[i, :, i, :] += Ad.T @ W @ Ad
+            information[i, :, j, :] -= Ad.T @ W
+            information[j, :, i, :] -= W @ Ad
