@@ -30,9 +30,8 @@ class RelativePose:
     def scaled(self, scale: float) -> RelativePose:
         """Return the same in another unit of length."""
         units = np.repeat([1.0, scale], len(self.covariance) // 2)
-        return RelativePose(
-            self.keyframe_id, se3.scaled(self.T_ref_kf, scale), units[:, None] * self.covariance * units
-        )
+        covariance = units[:, None] * self.covariance * units
+        return RelativePose(self.keyframe_id, se3.scaled(self.T_ref_kf, scale), covariance)
 
     def seen_from(self, keyframe_id: int, T_kf_ref: FloatArray) -> RelativePose:
         """Return the same relative to another keyframe, of which the old one's place is known."""

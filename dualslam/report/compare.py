@@ -13,7 +13,7 @@ from dualslam.core.geometry import sim3
 from dualslam.core.types import Failure, FloatArray, FrameStatus
 from dualslam.report.canvas import Canvas
 from dualslam.report.markup import Markup, document, join, number, number_row, stretched, table, tag
-from dualslam.report.page import headline
+from dualslam.report.page import flattened, headline
 from dualslam.report.placement import Placed, align, extent, plane_from_above, position_errors
 from dualslam.report.run_data import PosedRows, RunData, read_run
 from dualslam.report.statuses import MEANING, WITHOUT_POSE, count, span, stretches
@@ -264,7 +264,7 @@ def _strip_sample(status: FrameStatus) -> Markup:
 
 
 def _config_table(runs: Sequence[RunData], names: Sequence[str]) -> Markup:
-    flat = [dict(_flat(run.config)) for run in runs]
+    flat = [dict(flattened(run.config)) for run in runs]
     fields = list(dict.fromkeys(name for config in flat for name in config))
     rows = [
         [name, *(str(config.get(name, "-")) for config in flat)]
@@ -279,13 +279,6 @@ def _config_table(runs: Sequence[RunData], names: Sequence[str]) -> Markup:
 def _side_by_side(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> Markup:
     whole = table(heads, [number_row(row[0], row[1:]) for row in rows], "plain beside")
     return tag("div", whole, cls="scroll", tabindex=0, role="region", aria_label="table, scrolls sideways")
-
-
-def _flat(config: dict[str, Any], prefix: str = "") -> list[tuple[str, Any]]:
-    found: list[tuple[str, Any]] = []
-    for name, value in config.items():
-        found += _flat(value, f"{prefix}{name}.") if isinstance(value, dict) else [(prefix + name, value)]
-    return found
 
 
 def _sample(cls: str) -> Markup:

@@ -195,10 +195,11 @@ def _section(title: str, content: object) -> Markup | None:
 
 def _configuration(run: RunData) -> Markup:
     default = Config().model_dump(mode="json")
-    changed = _differences(run.config, default)
+    usual = dict(flattened(default))
     rows = [
         tag("tr", tag("th", name, scope="row"), tag("td", _short(value)), tag("td", _short(was)))
-        for name, value, was in changed
+        for name, value in flattened(run.config)
+        if (was := usual.get(name)) != value
     ]
     changes = tag("div", table(("field", "here", "default"), rows, "plain"), cls="scroll")
     words = tag("p", "All fields have their default values.", cls="empty")
@@ -211,14 +212,11 @@ def _short(value: object) -> str:
     return f"{value:.6g}" if isinstance(value, float) else str(value)
 
 
-def _differences(here: dict[str, Any], default: dict[str, Any], prefix: str = "") -> list[tuple[str, Any, Any]]:
-    found = []
-    for name, value in here.items():
-        was = default.get(name)
-        if isinstance(value, dict) and isinstance(was, dict):
-            found += _differences(value, was, f"{prefix}{name}.")
-        elif value != was:
-            found.append((prefix + name, value, was))
+def flattened(config: dict[str, Any], prefix: str = "") -> list[tuple[str, Any]]:
+    """Return all fields of a configuration by their dotted names, with their values."""
+    found: list[tuple[str, Any]] = []
+    for name, value in config.items():
+        found += flattened(value, f"{prefix}{name}.") if isinstance(value, dict) else [(prefix + name, value)]
     return found
 
 
