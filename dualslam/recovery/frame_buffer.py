@@ -40,7 +40,7 @@ class FrameBuffer:
     def __init__(self, duration_s: float, max_mb: float) -> None:
         self.nbytes = 0
         self.peak_bytes = 0
-        self._duration_s = duration_s
+        self.duration_s = duration_s
         self._max_bytes = max_mb * MB
         self._views: deque[View] = deque()
         self._late: deque[LateFrame] = deque()
@@ -69,11 +69,6 @@ class FrameBuffer:
         return tuple(self._late)
 
     @property
-    def duration_s(self) -> float:
-        """Seconds of video that are kept while all is well."""
-        return self._duration_s
-
-    @property
     def numbers(self) -> dict[str, float]:
         """Its contents, for the event log."""
         images = sum(view.image is not None for view in self._views)
@@ -83,8 +78,8 @@ class FrameBuffer:
         """Take the newest view in and, unless frozen, let go of those that are older than the buffer's duration."""
         self._views.append(view)
         self.nbytes += view.nbytes
-        n_least = SLOW_HZ * self._duration_s
-        while not self._frozen and len(self._views) > n_least and self._age_s(self._views[0]) > self._duration_s:
+        n_least = SLOW_HZ * self.duration_s
+        while not self._frozen and len(self._views) > n_least and self._age_s(self._views[0]) > self.duration_s:
             self.nbytes -= self._views.popleft().nbytes
         while self._late and self._late[0].index < self._views[0].index:
             self.nbytes -= self._late.popleft().nbytes
@@ -200,7 +195,7 @@ class FrameBuffer:
         if not self._frozen:
             return range(0)
         start = next((i + 1 for i, view in enumerate(views) if view.index == self._before_loss), 0)
-        recent = next((i for i, view in enumerate(views) if self._age_s(view) <= self._duration_s), len(views))
+        recent = next((i for i, view in enumerate(views) if self._age_s(view) <= self.duration_s), len(views))
         return range(start, max(start, recent))
 
 

@@ -38,6 +38,7 @@ class Pace:
     """Knows how late the frames are, and how many keyframes the graph beside does not know yet.
 
     - `in_real_time`: whether frames come by a clock.
+    - `late_s`: how late the frame in hand is (s); 0 without a clock.
     - `clock`: seconds; measures by how much background results hold a frame up.
     """
 
@@ -45,19 +46,19 @@ class Pace:
         self.statistics = PaceStatistics()
         self.clock: Callable[[], float] = time.perf_counter
         self.in_real_time = False
-        self._late_s = 0.0
+        self.late_s = 0.0
         self._lag = 0
         self._n_put_off = 0
 
     def note(self, late_s: float) -> None:
         """Note, before a frame is looked at, how late it is: real time has begun with the first."""
         self.in_real_time = True
-        self._late_s = late_s
+        self.late_s = late_s
         self.statistics.behind += self.behind
 
     def hold_up(self, seconds: float) -> None:
         """Note by how much more a frame is late, since background results came in before it."""
-        self._late_s += seconds
+        self.late_s += seconds
 
     def note_lag(self, n_keyframes: int) -> None:
         """Note how many keyframes the graph beside does not know yet."""
@@ -65,14 +66,9 @@ class Pace:
         self.statistics.max_lag_keyframes = max(self.statistics.max_lag_keyframes, n_keyframes)
 
     @property
-    def late_s(self) -> float:
-        """How late the frame in hand is (s); 0 without a clock."""
-        return self._late_s
-
-    @property
     def behind(self) -> bool:
         """Whether tracking or back end have something to catch up on."""
-        return self.in_real_time and (self._late_s > BEHIND_S or self._lag > FAR_BEHIND_KEYFRAMES)
+        return self.in_real_time and (self.late_s > BEHIND_S or self._lag > FAR_BEHIND_KEYFRAMES)
 
     def puts_off(self, n_tracked: int, n_weak: int) -> bool:
         """Whether a keyframe that is due is put off to a later frame.

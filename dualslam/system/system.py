@@ -71,6 +71,8 @@ class System:
         The frames' own count, by which all here goes but the frames that `step` is given and its results.
     saved : StoredMap or None
         The map that this run continues.
+    world : int or None
+        The submap in whose frame that map's world is.
     """
 
     def __init__(
@@ -82,8 +84,8 @@ class System:
         self.blank: set[int] = set()
         self._before: View | None = None  # the frame before, of those that were read
         self._apart = set[int]()  # it and the lost frames before it from which nothing leads to a pose
-        self._world = saved.main[0] if saved is not None and saved.main else None
-        self._worlds = Worlds(record.atlas, self._world)
+        self.world = saved.main[0] if saved is not None and saved.main else None
+        self._worlds = Worlds(record.atlas, self.world)
         self._earlier = earlier = frozenset(record.atlas.submaps)
         self.atlas, self.rows, self.poses = record.atlas, record.rows, record.poses
         self.events, self.timer = record.events, record.timer
@@ -160,11 +162,6 @@ class System:
     def hidden(self) -> BoolArray | None:
         """Pixels (H, W) that were found to stand still in the image, and are left out; None while there are none."""
         return self._state.parts.scene.hidden
-
-    @property
-    def world(self) -> int | None:
-        """The submap in whose frame the saved map's world is; None without one."""
-        return self._world
 
     @property
     def live(self) -> VisualOdometry | None:

@@ -68,6 +68,7 @@ class LiveScene:
 
     - `stale`: submaps that were drawn anew since this was last emptied.
     - `S_world` dict of int to (4, 4).
+    - `size`: of a keyframe as it is drawn.
     - `T_world_cam` (4, 4) or None: the newest camera that has a pose.
     """
 
@@ -80,7 +81,7 @@ class LiveScene:
         self.walks: tuple[DrawnWalk, ...] = ()
         self.statuses: list[str] = []
         self._arrays: dict[int, SubmapArrays] = {}
-        self._size = 0.0
+        self.size = 0.0
 
     def take(self, message: Message) -> None:
         """Follow a run by one message."""
@@ -101,11 +102,6 @@ class LiveScene:
         self.walks = tuple(
             _drawn_walk(w, S_world[w.news.submap_id]) for w in message.walks if w.news.submap_id in S_world
         )
-
-    @property
-    def size(self) -> float:
-        """How large a keyframe is drawn."""
-        return self._size
 
     def bounds(self) -> tuple[FloatArray, FloatArray]:
         """Return the box around all cameras, and landmarks but for the `1 - WITHIN` furthest out on each side."""
@@ -194,15 +190,15 @@ class LiveScene:
             return False
         extent = float(np.linalg.norm(np.ptp(np.concatenate(centres), axis=0)))
         wanted = max(FRUSTUM_SHARE * extent, 0.02)
-        if 0.67 * wanted <= self._size <= 1.5 * wanted:
+        if 0.67 * wanted <= self.size <= 1.5 * wanted:
             return False  # all that is drawn is sent anew: not for every step
-        self._size = wanted
+        self.size = wanted
         return True
 
     def _draw(self, arrays: SubmapArrays, S: FloatArray) -> Drawn:
         T = np.array([sim3.act_on_pose(S, T) for T in arrays.T_submap_kf.astype(float)]).reshape(-1, 4, 4)
         centres = T[:, :3, 3]
-        corners = centres[:, None] + np.einsum("kij,cj->kci", T[:, :3, :3], FRUSTUM * self._size)
+        corners = centres[:, None] + np.einsum("kij,cj->kci", T[:, :3, :3], FRUSTUM * self.size)
         sides = np.stack([np.broadcast_to(centres[:, None], corners.shape), corners], axis=2)
         rims = np.stack([corners, np.roll(corners, -1, axis=1)], axis=2)
         pyramids = np.concatenate([sides, rims], axis=1)  # (K, 8, 2, 3)

@@ -35,6 +35,7 @@ UNANSWERED = frozenset({JobKind.FORESIGHT})
 class ScheduledDesk:
     """The `dualslam.core.jobs.Desk` whose answers come by a schedule.
 
+    - `policy`: when answers are given out, where nobody's clock goes on.
     - `finish_wait_s`: how long the end of a run that was interrupted waits for what is under way.
     - `budget_s`: time after which a job that can stop early must, in real time.
 
@@ -46,7 +47,7 @@ class ScheduledDesk:
     ) -> None:
         self.executor = executor
         self.on_record: Callable[[dict[str, Any]], None] | None = None
-        self._policy = policy
+        self.policy = policy
         self._finish_wait_s = finish_wait_s
         self._budget_s = budget_s
         self._step = 0
@@ -60,14 +61,9 @@ class ScheduledDesk:
         self._given: defaultdict[JobKind, list[Ended]] = defaultdict(list)
 
     @property
-    def policy(self) -> Policy:
-        """When answers are given out, where nobody's clock goes on."""
-        return self._policy
-
-    @property
     def recorded(self) -> Recorded | None:
         """The schedule that is repeated; None where there is none."""
-        return self._policy if isinstance(self._policy, Recorded) else None
+        return self.policy if isinstance(self.policy, Recorded) else None
 
     # --- time
 
@@ -170,7 +166,7 @@ class ScheduledDesk:
             self._look({r.kind for r in self._open.values()})
             self._hand_over([r for r in self._open.values() if r.number in self._arrived])
         else:
-            self._hand_over([r for r in self._open.values() if self._policy.is_due(r, self._step, self._frame)])
+            self._hand_over([r for r in self._open.values() if self.policy.is_due(r, self._step, self._frame)])
 
     def _hand_over(self, requests: list[Request]) -> None:
         for request in requests:
