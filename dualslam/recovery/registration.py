@@ -72,15 +72,18 @@ class Registration:
 
     def _grow(self) -> None:
         due, n_adjusted = set(self.views), self._adjust_all()
+        n_asked = n_adjusted
         while len(self.submap.keyframes) < MAX_KEYFRAMES:
             for i in sorted(due):
                 self._ask(i)
             due.clear()
             best = max(self._tracks, key=lambda i: (self._tracks[i].n_inliers, -i), default=None)
             if best is None:
-                if len(self.submap.keyframes) == n_adjusted:
+                if len(self.submap.keyframes) == n_asked:
                     return
                 due, n_adjusted = set(self.views), self._adjust_all()
+                n_asked = n_adjusted
+                self._repeated.clear()  # the map shows more now, by which two poses differ
                 continue
             # The map has grown, or was adjusted, since the frame was posed.
             if not self._ask(best) or self._is_repeated(best):

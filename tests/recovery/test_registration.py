@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from functools import partial
 
 import numpy as np
+import pytest
 
 from dualslam.backend.local_ba import adjust_and_prune, parallax_rad
 from dualslam.core.config.settings import Config
 from dualslam.core.geometry import se3, so3
-from dualslam.core.types import FloatArray, Keyframe
+from dualslam.core.types import Failure, FailureReason, FloatArray, Keyframe, Track
 from dualslam.core.walk_news import WalkWatch
 from dualslam.frontends.features.orb import OrbFrontend
 from dualslam.frontends.tracking.registrar import Registrar
@@ -72,6 +73,22 @@ def test_frames_in_any_order_are_found_where_they_are() -> None:
     position, angle = pose_errors(submap.keyframe_poses(ids), world.T_world_cam[ids])
     assert position.max() < POSITION_M
     assert angle.max() < ROTATION_RAD
+
+
+def test_a_frame_with_two_poses_is_asked_again_when_the_map_shows_more(monkeypatch: pytest.MonkeyPatch) -> None:
+    world = PointWorld(cloud(300), hand_held(120))
+    refuse, n_refused = Registrar.refuse_repeated, 0
+
+    def refuse_once(self: Registrar, track: Track, keyframe_ids: Collection[int]) -> Failure | None:
+        nonlocal n_refused
+        if track.view.index == 20 and not n_refused:
+            n_refused += 1
+            return Failure(FailureReason.LOOK_ALIKE, "another pose explains as much")
+        return refuse(self, track, keyframe_ids)
+
+    monkeypatch.setattr(Registrar, "refuse_repeated", refuse_once)
+    assert registered(world, true_map(world, [0, 4, 8, 12]), [20, 50]) == [50, 20]
+    assert n_refused == 1
 
 
 def test_frames_of_something_else_leave_the_map_as_it_was() -> None:
