@@ -12,10 +12,15 @@ from dualslam.atlas.record import Record
 from dualslam.atlas.trajectory import FramePose
 from dualslam.core.bundle import FrameRows
 from dualslam.core.geometry import se3, sim3
+from dualslam.core.geometry.projection import settle_poses
 from dualslam.core.types import FloatArray, IntArray
 from dualslam.map.anchors import Anchor
+from dualslam.map.frame_observations import seen_now
 from dualslam.map.submap import Submap
 from dualslam.map.submap_change import change_of_frame
+
+FRAMES_AT_ONCE = 64
+"""That are posed anew: what some 10,000 observations need stays in a core's cache."""
 
 
 def propagate_poses(poses: Iterable[FramePose], before: Submap, after: Submap) -> list[FramePose]:
@@ -108,16 +113,18 @@ def rows_of_frames(record: Record, submap: Submap, at_most: int, min_inliers: in
     """
     own = np.array(sorted(_frames_of(record, submap)), np.int64)
     chosen = own[np.linspace(0, len(own) - 1, min(at_most, len(own))).round().astype(np.int64)]
-    rows = [(record.poses[i], *record.observations[i].seen_now(submap)) for i in chosen.tolist()]
-    rows = [row for row in rows if len(row[1]) >= min_inliers]
-    n_seen = np.array([len(ids) for _, ids, _, _ in rows], np.int64)
-    return FrameRows(
-        se3.stack([submap.resolve_anchor(p.keyframe_id, p.T_kf_cam) for p, *_ in rows]),
-        np.repeat(np.arange(len(rows)), n_seen),
-        np.concatenate([np.zeros(0, np.int64), *(ids for _, ids, _, _ in rows)]),
-        np.concatenate([np.zeros((0, 2)), *(uv_px for _, _, uv_px, _ in rows)]),
-        np.concatenate([np.zeros(0), *(sigma_px for _, _, _, sigma_px in rows)]),
-    )
+    return _rows_of(record, submap, chosen.tolist(), min_inliers)[1]
+
+
+def _rows_of(record: Record, submap: Submap, frames: list[int], min_inliers: int) -> tuple[list[int], FrameRows]:
+    """Return which of some frames have seen enough, and what."""
+    frame, ids, uv_px, sigma_px = seen_now([record.observations[i] for i in frames], submap)
+    enough = np.bincount(frame, minlength=len(frames)) >= min_inliers
+    known, number = enough[frame], np.cumsum(enough) - 1
+    kept = [i for i, is_kept in zip(frames, enough.tolist(), strict=True) if is_kept]
+    poses = [record.poses[i] for i in kept]
+    T_submap_cam = se3.stack([submap.resolve_anchor(pose.keyframe_id, pose.T_kf_cam) for pose in poses])
+    return kept, FrameRows(T_submap_cam, number[frame[known]], ids[known], uv_px[known], sigma_px[known])
 
 
 def pose_frames_anew(record: Record, submap: Submap, shape: float, min_inliers: int) -> int:
@@ -129,14 +136,17 @@ def pose_frames_anew(record: Record, submap: Submap, shape: float, min_inliers: 
     - `shape`: of the loss under which it was refined, in the pixels' sigmas.
     - `min_inliers`: a frame of which fewer landmarks agree stays where it is.
     """
-    n_posed = 0
-    for i in _frames_of(record, submap):
-        pose = record.poses[i]
-        T_submap_cam = submap.resolve_anchor(pose.keyframe_id, pose.T_kf_cam)
-        T_submap_cam_now = record.observations[i].pose(submap, T_submap_cam, shape, min_inliers)
-        if T_submap_cam_now is not None:
-            record.poses[i] = pose.at(submap.anchored(pose.keyframe_id, T_submap_cam_now))
-            n_posed += 1
+    own, n_posed = _frames_of(record, submap), 0
+    for begin in range(0, len(own), FRAMES_AT_ONCE):
+        frames, seen = _rows_of(record, submap, own[begin : begin + FRAMES_AT_ONCE], min_inliers)
+        xyz_mu, T_cam_submap = submap.landmarks["xyz_mu"][seen.landmark_ids], se3.inverse(seen.T_submap_cam)
+        what = seen.frame, xyz_mu, seen.uv_px, seen.sigma_px
+        settled = settle_poses(submap.K, T_cam_submap, *what, shape=shape, min_inliers=min_inliers)
+        for i, T in zip(frames, settled, strict=True):
+            if np.isfinite(T).all():
+                pose = record.poses[i]
+                record.poses[i] = pose.at(submap.anchored(pose.keyframe_id, se3.inverse(T)))
+                n_posed += 1
     return n_posed
 
 

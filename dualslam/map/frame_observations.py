@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from itertools import groupby
+from operator import attrgetter
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dualslam.core.arrays import is_first
-from dualslam.core.geometry import se3
-from dualslam.core.geometry.projection import settle_pose
-from dualslam.core.types import Failure, Features, FloatArray, IntArray
+from dualslam.core.types import Features, FloatArray, IntArray
 from dualslam.map.submap import NO_LANDMARK, Submap
 
 Change = Callable[[Features], Features]
@@ -59,30 +59,6 @@ class FrameObservations:
         """Return the same in the pixels of another camera or shutter."""
         return replace(self, changes=(*self.changes, change))
 
-    def pose(self, submap: Submap, T_submap_cam: FloatArray, shape: float, min_inliers: int) -> FloatArray | None:
-        """Return (4, 4) ``T_submap_cam`` by the current landmarks; None where they do not fix it.
-
-        - `T_submap_cam` (4, 4): to begin with.
-        - `shape`, `min_inliers`: see `settle_pose`.
-        """
-        ids, uv_px, sigma_px = self.seen_now(submap)
-        pose = settle_pose(
-            submap.K,
-            se3.inverse(T_submap_cam),
-            submap.landmarks["xyz_mu"][ids],
-            uv_px,
-            sigma_px,
-            shape=shape,
-            min_inliers=min_inliers,
-        )
-        return None if isinstance(pose, Failure) else se3.inverse(pose)
-
-    def seen_now(self, submap: Submap) -> tuple[IntArray, FloatArray, FloatArray]:
-        """Return landmarks (M,), rectified pixels (M, 2) and their sigmas (M,): of what is left, each landmark once."""
-        ids = submap.current_ids(self.landmark_ids.astype(np.int64))
-        rows = np.flatnonzero((ids != NO_LANDMARK) & is_first(ids))
-        return ids[rows], self.uv_rect_now_px()[rows], self.sigma_px[rows].astype(np.float64)
-
     def uv_rect_now_px(self) -> FloatArray:
         """Return (N, 2) rectified pixels, with what has become of them since."""
         if not self.changes:
@@ -96,3 +72,29 @@ class FrameObservations:
         for change in self.changes:
             features = change(features)
         return features.uv_rect_px
+
+
+def seen_now(frames: Sequence[FrameObservations], submap: Submap) -> tuple[IntArray, IntArray, FloatArray, FloatArray]:
+    """Return what frames see of a submap as it is: of what is left, each landmark once in a frame.
+
+    Frames (M,), ascending, landmarks (M,), rectified pixels (M, 2) and their sigmas (M,).
+    """
+    # Neighbours have mostly gone through the same changes, which cost more by the call than by the pixel.
+    joined = [_joined(list(alike)) for _, alike in groupby(frames, attrgetter("changes"))]
+    frame, nothing = np.repeat(np.arange(len(frames)), [len(each.landmark_ids) for each in frames]), np.zeros(0)
+    ids = submap.current_ids(np.concatenate([nothing, *(each.landmark_ids for each in joined)]).astype(np.int64))
+    rows = np.flatnonzero((ids != NO_LANDMARK) & is_first(frame * (len(submap.landmarks) + 1) + ids))
+    uv_px = np.concatenate([np.zeros((0, 2)), *(each.uv_rect_now_px() for each in joined)])
+    sigma_px = np.concatenate([nothing, *(each.sigma_px for each in joined)])
+    return frame[rows], ids[rows], uv_px[rows], sigma_px[rows]
+
+
+def _joined(frames: list[FrameObservations]) -> FrameObservations:
+    """Return the observations of frames of the same changes as if one had made them."""
+    return replace(
+        frames[0],
+        landmark_ids=np.concatenate([each.landmark_ids for each in frames]),
+        uv_px=np.concatenate([each.uv_px for each in frames]),
+        uv_rect_px=np.concatenate([each.uv_rect_px for each in frames]),
+        sigma_px=np.concatenate([each.sigma_px for each in frames]),
+    )

@@ -6,6 +6,7 @@ import numpy as np
 
 from dualslam.core.geometry import se3
 from dualslam.core.geometry.projection import project_points
+from dualslam.map.frame_observations import seen_now
 from dualslam.system.system import System
 
 
@@ -20,7 +21,7 @@ def residuals_px(system: System) -> dict[int, float]:
         if pose is None or pose.submap_id != seen.submap_id:
             continue
         submap = system.atlas.submaps[pose.submap_id]
-        ids, seen_px, _ = seen.seen_now(submap)
+        _, ids, seen_px, _ = seen_now([seen], submap)
         if not len(ids):  # posed by other features than those of the map
             continue
         T_cam_submap = se3.inverse(submap.resolve_anchor(pose.keyframe_id, pose.T_kf_cam))

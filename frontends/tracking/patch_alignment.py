@@ -106,9 +106,9 @@ class PatchAlignment:
 
     def refine(self, submap: Submap, rows: IntArray) -> None:
         """Move the pixels of observations to where their patches match, and remove those that match nowhere near."""
-        gone = {k for k in self._pyramids if k not in self._images}
-        self._pyramids = {k: levels for k, levels in self._pyramids.items() if k not in gone}
-        self._templates = {key: made for key, made in self._templates.items() if key[0] not in gone}
+        if gone := {k for k in self._pyramids if k not in self._images}:
+            self._pyramids = {k: levels for k, levels in self._pyramids.items() if k not in gone}
+            self._templates = {key: made for key, made in self._templates.items() if key[0] not in gone}
         pairs = self._pairs(submap, rows)
         tested, agrees = np.zeros(len(pairs.row), np.bool_), np.zeros(len(pairs.row), np.bool_)
         for of in _in_turn(pairs):

@@ -255,8 +255,8 @@ def share_landmarks(submap: Submap, matches: Collection[tuple[int, int, IntArray
 
     Returns int: how many pairs of features have come to see one landmark.
     """
-    obs = submap.observations
-    rows = np.flatnonzero(obs["alive"])
+    named = [submap.landmark_of[k][pairs[:, of]] for *two, pairs in matches for of, k in enumerate(two)]
+    obs, rows = submap.observations, submap.rows_of_landmarks(np.concatenate([np.zeros(0, np.int64), *named]))
     seen_in: dict[int, set[int]] = {}
     for landmark, k in zip(obs["landmark"][rows].tolist(), obs["kf"][rows].tolist(), strict=True):
         seen_in.setdefault(landmark, set()).add(k)

@@ -9,13 +9,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from dualslam.core.chi_square import CHI2_95, huber_weights
 from dualslam.core.geometry import se3
-from dualslam.core.types import BoolArray, Failure, FailureReason, FloatArray
+from dualslam.core.types import BoolArray, Failure, FailureReason, FloatArray, IntArray
 
 MIN_DEPTH = 1e-6
 """Points nearer to the image plane (or behind it) do not project."""
@@ -100,6 +101,10 @@ class _PoseProblem:
         """Set residuals at `T` and return chi2 (N,), infinite behind the camera."""
         p = T[:3, :3] @ self.xyz
         p += T[:3, 3:]
+        return self.evaluate_at(p)
+
+    def evaluate_at(self, p: FloatArray) -> FloatArray:
+        """Do the same with the points in the camera (3, N)."""
         z = p[2]
         front = z > MIN_DEPTH
         all_front = bool(front.all())
@@ -116,6 +121,11 @@ class _PoseProblem:
 
     def normal_equations(self, weight: FloatArray) -> FloatArray:
         """Return (7, 7): J'WJ bordered by J'Wr, for per-point weights, at the pose last evaluated."""
+        flat = self.weighted(weight).reshape(7, -1)
+        return np.asarray(flat @ flat.T, np.float64)
+
+    def weighted(self, weight: FloatArray) -> FloatArray:
+        """Return `rows` (7, 2, N), which the next call overwrites: times the roots of the weights."""
         A, iz, (x, y) = self.rows, self.inverse_depth, self.xy
         np.multiply(x, y, out=A[1, 1])
         np.negative(A[1, 1], out=A[0, 0])
@@ -132,8 +142,7 @@ class _PoseProblem:
         root = np.sqrt(weight)
         A[:6] *= self.whiten * root
         np.multiply(self.residual, root, out=A[6])
-        flat = A.reshape(7, -1)
-        return np.asarray(flat @ flat.T, np.float64)
+        return A
 
 
 def _exp(xi: list[float]) -> FloatArray:
@@ -239,50 +248,60 @@ def refine_pose(
     return _finish(problem, T, T_prior, prior_information, chi2, inliers, n_steps, counted)
 
 
-def settle_pose(
+def settle_poses(
     K: FloatArray,
     T_cam_w: FloatArray,
+    frame: IntArray,
     xyz: FloatArray,
     uv: FloatArray,
     sigma: FloatArray,
     *,
     shape: float,
     min_inliers: int = 6,
-) -> FloatArray | Failure:
-    """Refine a pose against known points under a loss that forgets outliers, to the optimum of those that agree.
+) -> FloatArray:
+    """Refine poses against known points under a loss that forgets outliers, to the optimum of those that agree.
 
     Gauss-Newton with the weights of Geman and McClure's loss. From afar that forgets what is right, the nearest points
-    first: it begins `WIDE` times as wide, and is half as wide at each step.
+    first: it begins `WIDE` times as wide, and is half as wide at each step. Many poses at once take less time each.
 
-    - `K`, `T_cam_w`, `xyz`, `uv`, `sigma`: as in `refine_pose`.
+    - `T_cam_w` (F, 4, 4): where to start.
+    - `frame` (N,): ascending: of which of them a point is.
+    - `K`, `xyz`, `uv`, `sigma`: as in `refine_pose`.
     - `shape`: of the loss, in sigmas: at so much of a residual a quarter of its weight is left.
-    - `min_inliers`: fewer points that agree, to within `shape`, are a failure.
+    - `min_inliers`: with fewer points that agree, to within `shape`, a pose is not settled.
 
-    Returns (4, 4) or Failure: ``T_cam_w``; `TOO_FEW_MATCHES`, `TOO_FEW_INLIERS`, or `DEGENERATE` where the points do
-    not fix the pose.
+    Returns (F, 4, 4) ``T_cam_w``: NaN where the points are too few, or do not fix it.
     """
-    n = len(xyz)
-    if n < min_inliers:
-        return Failure(FailureReason.TOO_FEW_MATCHES, f"{n} points, {min_inliers} needed", {"n": n})
     problem = _PoseProblem(K, np.asarray(xyz), np.asarray(uv), np.asarray(sigma))
-    T, width = np.array(T_cam_w, np.float64), WIDE
-    chi2 = problem.evaluate(T)
+    points = [slice(*ends) for ends in pairwise(np.searchsorted(frame, np.arange(len(T_cam_w) + 1)).tolist())]
+    T, width, G = np.array(T_cam_w, np.float64), WIDE, np.zeros((len(T_cam_w), 7, 7))
+    moves = np.bincount(frame, minlength=len(T)) >= min_inliers
+    T[~moves] = np.nan
+
+    def chi2_now() -> FloatArray:
+        at = T.take(frame, axis=0)
+        return problem.evaluate_at(np.einsum("nij,jn->in", at[:, :3, :3], problem.xyz) + at[:, :3, 3].T)
+
+    chi2 = chi2_now()
     for _ in range(MAX_SETTLING_STEPS):
-        G = problem.normal_equations((1.0 + chi2 / (width * shape) ** 2) ** -2)  # zero behind the camera
-        step = _solve(G)
-        if step is None:
-            return Failure(FailureReason.DEGENERATE, f"{n} points do not fix the pose")
-        T = _exp(step.tolist()) @ T
-        chi2 = problem.evaluate(T)
-        if width == 1.0 and -float(step @ G[:6, 6]) < TOLERANCE:
+        rows = problem.weighted((1.0 + chi2 / (width * shape) ** 2) ** -2)  # zero behind the camera
+        moving = np.flatnonzero(moves)
+        for f in moving.tolist():
+            own = rows[:, :, points[f]].reshape(7, -1)
+            G[f] = own @ own.T
+        step = _solve_each(G[moving])
+        T[moving] = se3.exp(step) @ T[moving]
+        gain = -np.einsum("fi,fi->f", step, G[moving, :6, 6])
+        moves[moving] = np.isfinite(gain) & ((gain >= TOLERANCE) | (width > 1.0))
+        chi2 = chi2_now()
+        if not moves.any():
             break
         width = max(width / 2, 1.0)
-    n_inliers = int(np.count_nonzero(chi2 < shape**2))
-    if n_inliers < min_inliers:
-        return Failure(FailureReason.TOO_FEW_INLIERS, f"{n_inliers} of {n} points, {min_inliers} needed")
-    if _half_covariance(G[:6, :6]) is None:
-        return Failure(FailureReason.DEGENERATE, f"{n_inliers} inliers do not fix the pose")
-    return _on_so3(T)
+    n_inliers = np.bincount(frame[chi2 < shape**2], minlength=len(T))
+    for f in np.flatnonzero(np.isfinite(T[:, 0, 0])).tolist():
+        fixed = n_inliers[f] >= min_inliers and _half_covariance(G[f, :6, :6]) is not None
+        T[f] = _on_so3(T[f]) if fixed else np.nan
+    return T
 
 
 def _solve(G: FloatArray) -> FloatArray | None:
@@ -292,6 +311,15 @@ def _solve(G: FloatArray) -> FloatArray | None:
     except np.linalg.LinAlgError:
         return None
     return step if math.isfinite(float(step.sum())) else None
+
+
+def _solve_each(G: FloatArray) -> FloatArray:
+    """Return the steps (N, 6) of as many normal equations (N, 7, 7): NaN where they are singular."""
+    try:
+        return np.asarray(np.linalg.solve(G[:, :6, :6], -G[:, :6, 6:])[:, :, 0], np.float64)
+    except np.linalg.LinAlgError:
+        steps = [_solve(each) for each in G]
+        return np.array([np.full(6, np.nan) if step is None else step for step in steps])
 
 
 def _finish(
