@@ -6,6 +6,7 @@ and patches that do not look alike tell of a wrong match.
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from typing import Any
@@ -102,13 +103,13 @@ class PatchAlignment:
     def __init__(self, images: KeyframeImages, camera: Callable[[], Camera]) -> None:
         self._images, self._camera = images, camera
         self._pyramids: dict[int, Pyramid] = {}
-        self._templates: dict[tuple[int, int], tuple[Any, ...]] = {}  # by keyframe and feature, each made once
+        self._templates = defaultdict[int, dict[int, tuple[Any, ...]]](dict)  # by keyframe and feature, each made once
 
     def refine(self, submap: Submap, rows: IntArray) -> None:
         """Move the pixels of observations to where their patches match, and remove those that match nowhere near."""
-        if gone := {k for k in self._pyramids if k not in self._images}:
-            self._pyramids = {k: levels for k, levels in self._pyramids.items() if k not in gone}
-            self._templates = {key: made for key, made in self._templates.items() if key[0] not in gone}
+        for k in [k for k in self._pyramids if k not in self._images]:
+            del self._pyramids[k]
+            self._templates.pop(k, None)
         pairs = self._pairs(submap, rows)
         tested, agrees = np.zeros(len(pairs.row), np.bool_), np.zeros(len(pairs.row), np.bool_)
         for of in _in_turn(pairs):
@@ -138,7 +139,7 @@ class PatchAlignment:
             uv_rect[at] += uv_rect_px[n + of] - uv_rect_px[of]
             submap.keyframes[k] = replace(keyframe, features=replace(features, uv_px=uv, uv_rect_px=uv_rect))
             for feature in at.tolist():
-                self._templates.pop((k, feature), None)
+                self._templates[k].pop(feature, None)
 
     def _pairs(self, submap: Submap, rows: IntArray) -> _Pairs:
         """Return the observations that have a reference, each with it.
@@ -192,17 +193,17 @@ class PatchAlignment:
     def _templates_about(self, pairs: _Pairs, uv_px: FloatArray, steps: FloatArray) -> _Templates:
         """Return the templates about the older observations."""
         keys = list(zip(pairs.kf_there.tolist(), pairs.feature_there.tolist(), strict=True))
-        row_of_new = {key: row for row, key in enumerate(keys) if key not in self._templates}
+        row_of_new = {(k, feature): row for row, (k, feature) in enumerate(keys) if feature not in self._templates[k]}
         if row_of_new:  # one call for all
             row = np.array(list(row_of_new.values()))
             new, image_of = np.unique(pairs.kf_there[row], return_inverse=True)
             images = [self._levels(k) for k in new.tolist()]
             made = _Templates.of(Sampler(images, image_of, steps[row], HALF + 1)(uv_px[row]))
-            self._templates.update(
-                zip(row_of_new, zip(made.greys, made.to_parameters, made.is_sound, strict=True), strict=True)
-            )
+            each = zip(made.greys, made.to_parameters, made.is_sound, strict=True)
+            for (k, feature), template in zip(row_of_new, each, strict=True):
+                self._templates[k][feature] = template
         side = 2 * HALF + 1
-        greys, to_parameters, is_sound = zip(*(self._templates[key] for key in keys), strict=True)
+        greys, to_parameters, is_sound = zip(*(self._templates[k][feature] for k, feature in keys), strict=True)
         return _Templates(
             np.concatenate(greys).reshape(-1, side, side),
             np.concatenate(to_parameters).reshape(-1, 3, side**2),

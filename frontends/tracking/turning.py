@@ -40,9 +40,9 @@ def turn_between(K: FloatArray, uv_a_px: FloatArray, uv_b_px: FloatArray) -> Flo
         is_narrow, gate = narrowed == gate, narrowed
         weight = 1 / (1 + (off_px / gate) ** 2)
         U, _, Vt = np.linalg.svd((rays_a * weight) @ rays_b.T)
-        if np.linalg.det(U) * np.linalg.det(Vt) < 0:
-            U[:, 2] = -U[:, 2]
         before, R_a_b = R_a_b, U @ Vt
+        if np.linalg.det(R_a_b) < 0:
+            R_a_b = U * [1.0, 1.0, -1.0] @ Vt
         if is_narrow and np.abs(R_a_b - before).max() < SETTLED:
             break
     off_px = _off_px(K, rays_a, rays_b, R_a_b)
