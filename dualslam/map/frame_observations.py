@@ -63,8 +63,7 @@ class FrameObservations:
         """Return (N, 2) rectified pixels, with what has become of them since."""
         if not self.changes:
             return self.uv_rect_px.astype(np.float64)
-        n = len(self.landmark_ids)
-        nothing = np.zeros(n)
+        nothing = np.zeros(len(self.landmark_ids))
         uv_px, uv_rect_px = self.uv_px.astype(np.float64), self.uv_rect_px.astype(np.float64)
         features = Features(
             uv_px, uv_rect_px, self.sigma_px.astype(np.float64), nothing, nothing.astype(np.int64), nothing, nothing
@@ -85,8 +84,7 @@ def seen_now(frames: Sequence[FrameObservations], submap: Submap) -> tuple[IntAr
     ids = submap.current_ids(np.concatenate([nothing, *(each.landmark_ids for each in joined)]).astype(np.int64))
     rows = np.flatnonzero((ids != NO_LANDMARK) & is_first(frame * (len(submap.landmarks) + 1) + ids))
     uv_px = np.concatenate([np.zeros((0, 2)), *(each.uv_rect_now_px() for each in joined)])
-    sigma_px = np.concatenate([nothing, *(each.sigma_px for each in joined)])
-    return frame[rows], ids[rows], uv_px[rows], sigma_px[rows]
+    return frame[rows], ids[rows], uv_px[rows], np.concatenate([nothing, *(each.sigma_px for each in joined)])[rows]
 
 
 def _joined(frames: list[FrameObservations]) -> FrameObservations:
