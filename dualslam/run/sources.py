@@ -20,6 +20,7 @@ from dualslam.io.read_ahead import read_ahead
 from dualslam.io.reduced import MAX_SIDE_PX
 from dualslam.io.sequence import RecordedSequence, Selection
 from dualslam.io.trajectory_files import Trajectory
+from dualslam.io.video import is_live
 from dualslam.lab.synthetic import SyntheticSequence, make_sequence, parse_events
 
 SYNTHETIC = "synthetic:"
@@ -103,12 +104,13 @@ def open_images_of_run(
 
     Raises `InputError` if it cannot be read, is live, or has images of another size, or others than `pictures`.
     """
+    if is_live(source):
+        raise InputError(f"{source} is live: its frames cannot be read again.")
     has_camera = str(source).startswith(SYNTHETIC)  # recordings may have one, and that comes before a field of view
     fov_degrees, unit = (None, None) if has_camera else (ANY_FOV_DEG, "s")  # times do not matter
     of_bag = topic if has_topics(Path(str(source))) else None
     opened = open_source(source, fov_degrees=fov_degrees, time_unit=unit, topic=of_bag, max_side_px=max(size_px))
-    if not isinstance(opened, RecordedSequence | WorldSequence):
-        raise InputError(f"{source} is live: its frames cannot be read again.")
+    assert isinstance(opened, RecordedSequence | WorldSequence)
     if opened.camera.size_px != size_px:
         raise InputError(f"{source} has images of another size than the run's.")
     _refuse_others(opened, source, pictures or {})

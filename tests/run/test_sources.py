@@ -31,6 +31,11 @@ def test_worlds_have_a_camera_of_their_own() -> None:
     assert len(opened) == 2
 
 
+def test_a_webcam_is_refused_for_what_it_is() -> None:
+    with pytest.raises(InputError, match="0 is live: its frames cannot be read again"):
+        open_images_of_run("0", SIZE)
+
+
 def test_images_of_another_size_are_refused(folder: Path) -> None:
     with pytest.raises(InputError, match="another size"):
         open_images_of_run(folder, (640, 480))
