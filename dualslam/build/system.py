@@ -11,6 +11,7 @@ import numpy as np
 
 from dualslam.atlas.stored_map import StoredMap, tidy
 from dualslam.backend.final_refinement import refine_submap, settle_ties
+from dualslam.backend.focal_change import find_focal_change
 from dualslam.backend.local_ba import adjust_and_prune
 from dualslam.backend.self_calibration import calibrate_together
 from dualslam.build.checks import check_config, check_given
@@ -161,6 +162,7 @@ def build_system(
                 robust_k=config.graph.robust_k,
                 seed=config.seed,
             ),
+            find_focal_change=partial(find_focal_change, config=config.calibration, seed=config.seed),
             shutter=shutter,
             scene=scene,
             walk_watch=watch,

@@ -112,6 +112,20 @@ class PreferredCamera:
     independent direction. None if the camera is as it was given."""
 
 
+@dataclass(frozen=True, slots=True)
+class FocalChange:
+    """Another focal length from some keyframe on than before it."""
+
+    keyframe_id: int
+    log_change: float
+    sigma: float
+
+    @property
+    def numbers(self) -> dict[str, float]:
+        """All but the place by name, for the event log."""
+        return {"log_change": self.log_change, "sigma": self.sigma}
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class KeyframeReport:
     """Effect of a keyframe on the map and its graph.

@@ -24,6 +24,7 @@ class EventKind(StrEnum):
     GRAPH_REBUILT = "graph_rebuilt"
     CALIBRATED = "calibrated"
     CALIBRATION_KEPT = "calibration_kept"
+    FOCAL_CHANGED = "focal_changed"
     SHUTTER_FOUND = "shutter_found"
     MASKED = "masked"
     CAMERA_STANDS = "camera_stands"

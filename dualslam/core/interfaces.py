@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from dualslam.core.bundle import FrameRows
 from dualslam.core.decisions import Ruling
-from dualslam.core.estimates import CalibrationEstimate, GraphEstimate, KeyframeReport
+from dualslam.core.estimates import CalibrationEstimate, FocalChange, GraphEstimate, KeyframeReport
 from dualslam.core.matchers import PixelMatches, PosedImage
 from dualslam.core.types import (
     BoolArray,
@@ -240,6 +240,9 @@ JointCalibrator = Callable[
 ]
 """Asks several submaps about the camera that they share, as a `SelfCalibrator` does one; also returns copies of them,
 changed to it. Raises `InputError` if the correction has no inverse somewhere in the image."""
+
+FocalChangeFinder = Callable[[list["Submap"], "Camera"], FocalChange | None]
+"""Finds whether the focal length changes during a run."""
 
 SubmapAdjuster = Callable[["Submap"], None]
 """Refines all poses and points of a submap in place, in batch. Raises `SolverError` where the solver fails."""

@@ -70,6 +70,7 @@ def judge_run(
         reasons += _replaced(system, trajectories, claims)
         camera, scores = judge_camera(system)
         reasons += [] if camera is None else [_about_all(rows, *camera)]
+        reasons += _zoom(system, rows)
         scores |= {
             str(ReasonCode.JUMP): float(jumps.max(initial=0.0)),
             str(ReasonCode.PHOTOMETRIC): found.worst,
@@ -277,6 +278,20 @@ def _still(system: System, trajectories: Trajectories) -> list[Reason]:
                 "Something that moves may have been followed. Do not use this map. Mask what moves."
             )
             return [Reason(ReasonCode.STILL, Level.DOUBTFUL, text, first, last)]
+    return []
+
+
+def _zoom(system: System, rows: Sequence[FrameRow]) -> list[Reason]:
+    """Return from which frame on the focal length is another one."""
+    for event in system.events.of_kind(EventKind.FOCAL_CHANGED):
+        since, change = system.numbers.index_of(event.frame), float(np.expm1(event.data["log_change"]))
+        text = (
+            f"From about frame {since} on the images show a focal length {100 * abs(change):.0f} % "
+            f"{'longer' if change > 0 else 'shorter'} than before. One is used for all frames, so the map may be bent. "
+            "Lock zoom and focus, or run both parts by themselves (--start, --max-frames)."
+        )
+        first, last = sorted((since, rows[-1].index))
+        return [Reason(ReasonCode.ZOOM, Level.USABLE, text, first, last)]
     return []
 
 

@@ -11,6 +11,7 @@ from dualslam.core.atlas_problem import AtlasSolver
 from dualslam.core.config.settings import Config
 from dualslam.core.interfaces import (
     FinalRefiner,
+    FocalChangeFinder,
     JointCalibrator,
     MapStarter,
     PatchCheck,
@@ -74,6 +75,7 @@ class Components:
     new_relocaliser: Callable[[Submap, SubmapGraph], Seeker]  # finds its submap wherever it is seen, goes on there
     calibration: Calibration
     calibrate_together: JointCalibrator
+    find_focal_change: FocalChangeFinder
     shutter: Shutter
     scene: Scene
     walk_watch: WalkWatch  # hears of reverse tracking that is under way

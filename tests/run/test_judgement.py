@@ -48,6 +48,16 @@ def test_a_run_that_poses_all_is_good() -> None:
     assert judged(run(ahead())) == Verdict(Level.GOOD)
 
 
+def test_a_zoom_makes_a_run_usable_from_where_it_is_seen() -> None:
+    system = run(ahead())
+    system.events.add(EventKind.FOCAL_CHANGED, 120, 4.0, None, log_change=-0.1, sigma=0.02)
+    verdict = judged(system)
+    assert verdict.level is Level.USABLE
+    (reason,) = verdict.reasons
+    assert (reason.code, reason.first_frame, reason.last_frame) == (ReasonCode.ZOOM, 120, N - 1)
+    assert "10 % shorter" in reason.text
+
+
 def test_a_jump_makes_a_run_doubtful_and_names_its_frames() -> None:
     truth = ahead()
     for i in range(120, N):

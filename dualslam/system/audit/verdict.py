@@ -34,6 +34,7 @@ class ReasonCode(StrEnum):
     PHOTOMETRIC = "photometric"
     STILL = "still"
     CAMERA = "camera"
+    ZOOM = "zoom"
     SCALE = "scale"
     REPLACED = "replaced"
     CRASHED = "crashed"
