@@ -9,6 +9,7 @@ import numpy as np
 from dualslam.core.geometry import se3
 from dualslam.core.noise_model import ROBUST_N
 from dualslam.core.types import FloatArray, Track, View
+from dualslam.map.submap import NO_LANDMARK
 
 MAX_EXTRAPOLATION = 3.0
 """Intervals for which the motion between the last two frames says something."""
@@ -30,10 +31,17 @@ class Motion:
     """The time that it took; negative where frames come in reverse. At rest, the shortest time between two keyframes:
     no frame of a slow sequence is a gap."""
     recent_s: tuple[float, ...] = ()  # the last intervals, as they were stamped
+    repeated_s: float = 0.0  # for how long the same image has come again
 
     def next(self, before: Track, after: Track) -> Motion:
-        """Return the motion that follows this one, from one track to the next."""
+        """Return the motion that follows this one, from one track to the next.
+
+        An image that comes again shows no motion: a video of another rate, or a camera that has no new one yet.
+        """
         interval_s = after.view.timestamp_s - before.view.timestamp_s
+        repeated_s = self.repeated_s + abs(interval_s)
+        if self.xi is not None and repeated_s < STEADY_S and _show_the_same(before, after):
+            return replace(self, repeated_s=repeated_s)
         recent_s = (*self.recent_s, interval_s)[-ROBUST_N:]
         usual_s = sorted(recent_s, key=abs)[(len(recent_s) - 1) // 2]
         if abs(interval_s) < MIN_SHARE * abs(usual_s):
@@ -68,3 +76,10 @@ class Motion:
     def _n_intervals(self, last: Track, timestamp_s: float) -> float:
         dt = self.interval_s
         return (timestamp_s - last.view.timestamp_s) / dt if dt != 0 else 1.0
+
+
+def _show_the_same(a: Track, b: Track) -> bool:
+    """Whether most of the landmarks that two frames share lie at the very same pixels in both."""
+    shared, in_a, in_b = np.intersect1d(a.landmark_ids, b.landmark_ids, return_indices=True)
+    still = (a.view.features.uv_px[in_a] == b.view.features.uv_px[in_b]).all(axis=1)[shared != NO_LANDMARK]
+    return 2 * int(np.count_nonzero(still)) > len(still)
