@@ -283,16 +283,15 @@ def _still(system: System, trajectories: Trajectories) -> list[Reason]:
 
 def _zoom(system: System, rows: Sequence[FrameRow]) -> list[Reason]:
     """Return from which frame on the focal length is another one."""
+    reasons = []
     for event in system.events.of_kind(EventKind.FOCAL_CHANGED):
         since, change = system.numbers.index_of(event.frame), float(np.expm1(event.data["log_change"]))
         text = (
-            f"From about frame {since} on the images show a focal length {100 * abs(change):.0f} % "
-            f"{'longer' if change > 0 else 'shorter'} than before. One is used for all frames, so the map may be bent. "
-            "Lock zoom and focus, or run both parts by themselves (--start, --max-frames)."
+            f"From about frame {since} on the focal length is {100 * abs(change):.0f} % "
+            f"{'longer' if change > 0 else 'shorter'} than before, and the map may be bent. Lock zoom and focus."
         )
-        first, last = sorted((since, rows[-1].index))
-        return [Reason(ReasonCode.ZOOM, Level.USABLE, text, first, last)]
-    return []
+        reasons.append(Reason(ReasonCode.ZOOM, Level.USABLE, text, *sorted((since, rows[-1].index))))
+    return reasons
 
 
 # --- clock
