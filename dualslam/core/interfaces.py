@@ -298,7 +298,7 @@ class Shutter(Protocol):
 
     @property
     def readout_s(self) -> float:
-        """Time between reading the first and the last row; 0: all at once, or not known yet."""
+        """Time between reading the first and the last row (or column, if upright); 0: all at once, or not known yet."""
         ...
 
     def shutter_corrected(self, view: View, camera: Camera) -> View:

@@ -1,7 +1,7 @@
 """The readout time of a rolling shutter, by what a map's own observations say of it.
 
 In a bundle of the keyframes that turn fast it is one more unknown, beside their poses and points: the camera sees each
-row in another orientation, and the frames around it give the rate of turn. A map, whose points are known from other
+line in another orientation, and the frames around it give the rate of turn. A map, whose points are known from other
 views, shows it to about a millisecond; pairs of frames only separate 20 ms from none.
 """
 
@@ -21,6 +21,7 @@ from dualslam.core.geometry import se3, so3
 from dualslam.core.geometry.projection import project_points, projection_jacobians
 from dualslam.core.noise_model import DAMPING, MIN_DEPTH_MU, PROOF_VIEWS, ROBUST_K, TINY
 from dualslam.core.types import BoolArray, Failure, FailureReason, FloatArray, IntArray
+from dualslam.frontends.tracking.turning import read_at
 from dualslam.map.submap import Submap
 
 MAX_KEYFRAMES = 40
@@ -59,20 +60,22 @@ class ReadoutQuestion:
         return np.where(front[:, None], (found - self.uv_px) / self.sigma_px[:, None], 0.0), front
 
 
-def ask_readout(submap: Submap, rates_rad_s: Mapping[int, FloatArray], height_px: int) -> ReadoutQuestion | Failure:
+def ask_readout(
+    submap: Submap, rates_rad_s: Mapping[int, FloatArray], size_px: tuple[int, int]
+) -> ReadoutQuestion | Failure:
     """Ask a submap for how much longer its images were read than its features were corrected for.
 
     - `submap`: is not changed.
     - `rates_rad_s` (mapping of int to (3,)): how the camera turns at each keyframe, in its own axes; those that are
       missing tell nothing.
-    - `height_px`: of the image.
+    - `size_px`: width and height of the image.
     """
     ids = np.array(sorted(k for k in submap.keyframes if k in rates_rad_s), np.int64)
     if len(ids) < MIN_KEYFRAMES:
         return Failure(FailureReason.DEGENERATE, f"{len(ids)} keyframes")
     rates = np.array([rates_rad_s[k] for k in ids.tolist()])
     chosen = _most_turning(rates)
-    question = _collect(submap, ids[chosen], rates[chosen], height_px)
+    question = _collect(submap, ids[chosen], rates[chosen], size_px)
     if len(question.kf) < MIN_OBSERVATIONS:
         return Failure(FailureReason.TOO_FEW_INLIERS, f"{len(question.kf)} observations")
     return question
@@ -99,7 +102,7 @@ def _most_turning(rates_rad_s: FloatArray) -> slice:
     return slice(first, first + MAX_KEYFRAMES)
 
 
-def _collect(submap: Submap, ids: IntArray, rates_rad_s: FloatArray, height_px: int) -> ReadoutQuestion:
+def _collect(submap: Submap, ids: IntArray, rates_rad_s: FloatArray, size_px: tuple[int, int]) -> ReadoutQuestion:
     obs, K = submap.observations, submap.K
     rows = np.flatnonzero(obs["alive"] & np.isin(obs["kf"], ids))
     kf, landmark = np.searchsorted(ids, obs["kf"][rows]), obs["landmark"][rows]
@@ -119,11 +122,11 @@ def _collect(submap: Submap, ids: IntArray, rates_rad_s: FloatArray, height_px: 
     uv, sigma = submap.observed_pixels(rows)
     f, c = np.diag(K)[:2], K[:2, 2]
     rays = np.column_stack([(uv - c) / f, np.ones(len(uv))])
-    read_v = np.empty(len(rows))
+    read_px = np.empty((len(rows), 2))
     for n, k in enumerate(ids.tolist()):
         here = kf == n
-        read_v[here] = submap.keyframes[k].features.uv_px[obs["feature"][rows[here]], 1]
-    turned = -np.cross(rates_rad_s[kf] * (read_v / height_px - 0.5)[:, None], rays)
+        read_px[here] = submap.keyframes[k].features.uv_px[obs["feature"][rows[here]]]
+    turned = -np.cross(rates_rad_s[kf] * read_at(read_px, size_px)[:, None], rays)
     by_readout = f * (turned[:, :2] - rays[:, :2] * turned[:, 2:])
     return ReadoutQuestion(K, T, submap.landmarks["xyz_mu"][points], kf, point, uv, sigma, by_readout)
 

@@ -14,7 +14,7 @@ from dualslam.core.noise_model import GATE_SIGMAS, INFLATION, TINY
 from dualslam.core.types import Features, FloatArray, View
 from dualslam.frontends.tracking.focal_search import MIN_MATCHES
 from dualslam.frontends.tracking.resection import poselib_camera
-from dualslam.frontends.tracking.turning import at_mid_row
+from dualslam.frontends.tracking.turning import at_middle
 
 READOUT_EVIDENCE = (GATE_SIGMAS * INFLATION) ** 2
 """Chi-square by which a rolling shutter must explain frames better than a global one, or a global one better than 0.02
@@ -26,7 +26,7 @@ READOUTS_S = STEP_S * np.arange(8)
 TYPICAL = 4
 """Place of the readout time, 0.02 s, that must be ruled out for a shutter to count as global."""
 MIN_SHIFT_PX = 3.0
-"""A view turns fast where so long a readout would shift its first and last rows by so much: several times what lens
+"""A view turns fast where so long a readout would shift its first and last lines by so much: several times what lens
 models get wrong. Only there can a readout be separated from these, and only there does it matter."""
 LAG, SPACING = 3, 3
 """Frames between the views of a pair, far enough for the turn to change; and between pairs, which do not overlap."""
@@ -56,7 +56,7 @@ class ReadoutEstimator:
         self._seed = seed
         self._min_evidence = min_evidence
         self._recent: list[tuple[View, FloatArray | None]] = []
-        self._direction = 1.0  # -1: rows are read from the last to the first
+        self._direction = 1.0  # -1: lines are read from the last to the first
         self._chi2, self._chi2_turned = np.zeros(len(READOUTS_S)), 0.0
         self._n_pairs = 0
         self.suspects = self.is_done = False
@@ -86,7 +86,7 @@ class ReadoutEstimator:
         self._chi2_turned += turned
         self._n_pairs += 1
         if self._chi2.min() - self._chi2_turned > SUSPICION * self._min_evidence:
-            # Images that were turned upside down: begin anew, from the last row to the first.
+            # Images that were turned upside down: begin anew, from the last line to the first.
             self._direction *= -1.0
             self._chi2, self._chi2_turned, self._n_pairs = np.zeros(len(READOUTS_S)), 0.0, 0
             return None
@@ -123,7 +123,7 @@ class ReadoutEstimator:
         self, a: Features, rate_a: FloatArray, b: Features, rate_b: FloatArray, camera: Camera
     ) -> tuple[FloatArray, float]:
         """Return the robust chi-square of the best relative pose of two views for each readout time (T,). The second
-        result is for a typical time with the rows read the other way round.
+        result is for a typical time with the lines read the other way round.
 
         RANSAC gives the poses for the shortest and the longest time. From there each pose is refined from that of the
         neighbouring time, upwards and downwards: RANSAC's own scatter would hide the differences between times.
@@ -133,7 +133,7 @@ class ReadoutEstimator:
         gate_px = CHI2_95[1] ** 0.5 * float(np.median(sigma_px))
         readouts_s = self._direction * np.append(READOUTS_S, -READOUTS_S[TYPICAL])
         views = ((a, rate_a), (b, rate_b))
-        moved = [at_mid_row(x.uv_rect_px, x.uv_px[:, 1], camera, *(s * rate for s in readouts_s)) for x, rate in views]
+        moved = [at_middle(x.uv_rect_px, x.uv_px, camera, *(s * rate for s in readouts_s)) for x, rate in views]
         straight = list(zip(*moved, strict=True))
         converged = {"step_tol": STEP_TOLERANCE}
         ransac = {"max_epipolar_error": gate_px, "max_iterations": 500, "min_iterations": 50, "seed": self._seed}
@@ -151,7 +151,7 @@ class ReadoutEstimator:
 
 
 def is_fast(rate_rad_s: FloatArray, camera: Camera) -> bool:
-    """Whether a typical readout would shift the first and last rows of such a view by more than lens errors."""
+    """Whether a typical readout would shift the first and last lines of such a view by more than lens errors."""
     return bool(READOUTS_S[TYPICAL] / 2 * camera.K[0, 0] * np.linalg.norm(rate_rad_s) > MIN_SHIFT_PX)
 
 

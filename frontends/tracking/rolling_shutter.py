@@ -1,6 +1,6 @@
-"""Rolling shutter: rows are read one after the other, so that a turning camera sees each from another direction.
+"""Rolling shutter: lines are read one after the other, so that a turning camera sees each from another direction.
 
-Pixels are corrected to the time of the middle row. That needs the rate of turn, from matches to the frame before, and
+Pixels are corrected to the time of the middle line. That needs the rate of turn, from matches to the frame before, and
 the camera's readout time.
 """
 
@@ -127,7 +127,7 @@ class RollingShutter:
     def may_start(self, view: View, camera: Camera) -> bool:
         """Whether a map may start from this view, found while there is none; what it tells of the shutter is taken in.
 
-        Of a camera that turns fast, with a shutter that is likely to roll, the rows' shifts would pass for parallax.
+        Of a camera that turns fast, with a shutter that is likely to roll, the lines' shifts would pass for parallax.
         """
         if self._estimator is None:
             return True
@@ -146,7 +146,7 @@ class RollingShutter:
 
     def ask(self, submap: Submap, rates_rad_s: Mapping[int, FloatArray], camera: Camera) -> ReadoutQuestion | Failure:
         """Ask a map for what of the readout is left in its keyframes, with how they turn (rad/s, in their own axes)."""
-        return ask_readout(submap, rates_rad_s, camera.height)
+        return ask_readout(submap, rates_rad_s, camera.size_px)
 
     def moved(self, features: Features, camera: Camera, turn_rad: FloatArray) -> Features:
         """Return a keyframe's features without so much more of a turn while it was read."""
@@ -179,7 +179,7 @@ def _as_read(view: View, camera: Camera) -> View:
     """Return a view with its turn put back in."""
     if view.turn_rad is None:
         return view
-    # Each feature was read in a row that is known once it is put back: a second time, it is.
+    # Each feature was read in a line that is known once it is put back: a second time, it is.
     first = correct_shutter(view.features, camera, -view.turn_rad)
-    features = correct_shutter(view.features, camera, -view.turn_rad, first.uv_px[:, 1])
+    features = correct_shutter(view.features, camera, -view.turn_rad, first.uv_px)
     return replace(view, features=features, turn_rad=None)

@@ -1,4 +1,4 @@
-"""How a camera turns from image to image, and what that does to pixels that are read row by row."""
+"""How a camera turns from image to image, and what that does to pixels that are read line by line."""
 
 from __future__ import annotations
 
@@ -63,32 +63,39 @@ def unit_rays(K: FloatArray, uv_px: FloatArray) -> FloatArray:
 
 
 def correct_shutter(
-    features: Features, camera: Camera, turn_rad: FloatArray, read_v_px: FloatArray | None = None
+    features: Features, camera: Camera, turn_rad: FloatArray, read_px: FloatArray | None = None
 ) -> Features:
-    """Move features to where they would be had all rows been read at the time of the middle one.
+    """Move features to where they would be had all lines been read at the time of the middle one.
 
-    - `features`: as found in an image that was read row by row.
+    - `features`: as found in an image that was read line by line (`read_at`).
     - `turn_rad` (3,): rotation vector by which the camera turns while an image is read, in its own axes.
-    - `read_v_px` (N,): rows in which the features were read, where `features` does not tell.
+    - `read_px` (N, 2): where the features were read, if `features` does not tell.
     """
-    read_v_px = features.uv_px[:, 1] if read_v_px is None else read_v_px
-    (uv_rect_px,) = at_mid_row(features.uv_rect_px, read_v_px, camera, turn_rad)
+    read_px = features.uv_px if read_px is None else read_px
+    (uv_rect_px,) = at_middle(features.uv_rect_px, read_px, camera, turn_rad)
     # The found pixels move alike, so that the same features can be rectified again by a better camera.
     return replace(features, uv_px=features.uv_px + uv_rect_px - features.uv_rect_px, uv_rect_px=uv_rect_px)
 
 
-def at_mid_row(
-    uv_rect_px: FloatArray, read_v_px: FloatArray, camera: Camera, *turns_rad: FloatArray
-) -> list[FloatArray]:
-    """Return rectified pixels (N, 2), read in rows (N,), as they would be at the time of the middle row.
+def at_middle(uv_rect_px: FloatArray, read_px: FloatArray, camera: Camera, *turns_rad: FloatArray) -> list[FloatArray]:
+    """Return rectified pixels (N, 2), read at pixels (N, 2), as they would be at the time of the middle line.
 
     For each of several turns (3,) of the camera while an image is read, in its own axes.
     """
-    return [_to_mid_row(uv_rect_px, camera, turn_rad)(read_v_px) for turn_rad in turns_rad]
+    return [_to_middle(uv_rect_px, camera, turn_rad)(read_px) for turn_rad in turns_rad]
 
 
-def _to_mid_row(uv_rect_px: FloatArray, camera: Camera, turn_rad: FloatArray) -> Callable[[FloatArray], FloatArray]:
-    """Return what `at_mid_row` does with rows (N,), by Rodrigues' formula: N matrices take thrice as long."""
+def read_at(read_px: FloatArray, size_px: tuple[int, int]) -> FloatArray:
+    """Return when pixels (N, 2) are read, as shares of the readout from the middle line (N,).
+
+    A sensor's lines run along its longer side. So an upright image is read column by column.
+    """
+    across = int(size_px[0] >= size_px[1])
+    return np.asarray(read_px[:, across] / size_px[across] - 0.5)
+
+
+def _to_middle(uv_rect_px: FloatArray, camera: Camera, turn_rad: FloatArray) -> Callable[[FloatArray], FloatArray]:
+    """Return what `at_middle` does with pixels (N, 2), by Rodrigues' formula: N matrices take thrice as long."""
     K = camera.K
     f, c = np.diag(K)[:2], K[:2, 2]
     rays = np.column_stack([(uv_rect_px - c) / f, np.ones(len(uv_rect_px))])
@@ -97,8 +104,8 @@ def _to_mid_row(uv_rect_px: FloatArray, camera: Camera, turn_rad: FloatArray) ->
     across = rays @ hat
     inwards = across @ hat
 
-    def moved(read_v_px: FloatArray) -> FloatArray:
-        by = (read_v_px / camera.height - 0.5) * angle_rad
+    def moved(read_px: FloatArray) -> FloatArray:
+        by = read_at(read_px, camera.size_px) * angle_rad
         # 1 - cos as a square: small turns keep their digits.
         turned = rays + np.sin(by)[:, None] * across + (2 * np.sin(0.5 * by) ** 2)[:, None] * inwards
         return np.asarray(f * turned[:, :2] / turned[:, 2:] + c, np.float64)
@@ -109,14 +116,14 @@ def _to_mid_row(uv_rect_px: FloatArray, camera: Camera, turn_rad: FloatArray) ->
 def straighten(uv_px: FloatArray, camera: Camera, turn_rad: FloatArray) -> FloatArray:
     """Return where things that an image shows at pixels (N, 2) are in the features: as `correct_shutter` moves them."""
     uv_rect_px, _ = camera.rectify(uv_px)
-    (moved_px,) = at_mid_row(uv_rect_px, uv_px[:, 1], camera, turn_rad)
+    (moved_px,) = at_middle(uv_rect_px, uv_px, camera, turn_rad)
     return uv_px + moved_px - uv_rect_px
 
 
 def find_as_read(uv_px: FloatArray, uv_rect_px: FloatArray, camera: Camera, turn_rad: FloatArray) -> FloatArray:
     """Return where an image shows what features have at pixels (N, 2), and rectified: inverse of `straighten`."""
-    read_px, moved = uv_px, _to_mid_row(uv_rect_px, camera, -turn_rad)
-    # Each was read in a row that is known once it is put back: a second time, it is.
+    read_px, moved = uv_px, _to_middle(uv_rect_px, camera, -turn_rad)
+    # Each was read in a line that is known once it is put back: a second time, it is.
     for _ in range(2):
-        read_px = uv_px + moved(read_px[:, 1]) - uv_rect_px
+        read_px = uv_px + moved(read_px) - uv_rect_px
     return read_px

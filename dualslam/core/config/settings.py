@@ -42,9 +42,10 @@ class CameraConfig(StrictModel):
     """Error of the camera model itself at a pixel (one sigma), beside the noise of the features: chequerboard
     calibrations and rectified data sets are off by half a pixel to a pixel towards the rim of the image."""
     readout_s: float | None = Field(None, ge=-0.1, le=0.1)
-    """Time between reading the first and the last row of an image. 0 for a global shutter, about 0.03 for webcams and
-    the first Kinect, negative for images turned upside down, whose last row was read first. null: it is estimated from
-    frames without a map. If the shutter probably rolls, no map starts from a fast turn until then."""
+    """Time between reading the first and the last row of an image, or column, where it is higher than wide. 0 for a
+    global shutter, about 0.03 for webcams and the first Kinect, negative where the last one was read first, as in
+    images turned upside down. null: it is estimated from frames without a map. If the shutter probably rolls, no map
+    starts from a fast turn until then."""
     find_still_pixels: bool = True
     """Find pixels that stand still in the image while the rest moves (a bonnet, black bars, a logo), and leave them
     out. No map starts while the camera itself stands still."""

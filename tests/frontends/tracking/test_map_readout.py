@@ -61,7 +61,7 @@ def made_map(readout_s: float, seed: int = 0) -> tuple[Submap, dict[int, FloatAr
 
 
 def told(submap: Submap, rates: dict[int, FloatArray]) -> ReadoutEstimate:
-    question = ask_readout(submap, rates, CAMERA.height)
+    question = ask_readout(submap, rates, CAMERA.size_px)
     assert isinstance(question, ReadoutQuestion)
     before = question.T_cam_submap.copy()
     answer = answer_readout(question)
@@ -141,7 +141,7 @@ def test_what_is_left_is_told_of_a_map_that_was_corrected(was_s: float) -> None:
 def test_a_few_keyframes_tell_nothing() -> None:
     submap, rates = made_map(READOUT_S)
     few = dict(list(rates.items())[: MIN_KEYFRAMES - 1])
-    assert not ask_readout(submap, few, CAMERA.height)
+    assert not ask_readout(submap, few, CAMERA.size_px)
 
 
 def test_pixels_are_put_back_to_where_they_were_read() -> None:

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from dualslam.core.camera.models import PinholeCamera
 from dualslam.core.config.settings import CameraConfig
 from dualslam.core.events import Event, EventKind
 from dualslam.core.geometry import se3, so3
@@ -95,6 +96,29 @@ def test_images_turned_upside_down_are_read_from_their_last_row_on(seed: int) ->
     for i in range(120):
         shutter.may_start(shutter.shutter_corrected(read_row_by_row(world, i, -READOUT_S), CAMERA), CAMERA)
     assert shutter.readout_s == pytest.approx(-READOUT_S, abs=0.005)
+
+
+def turned_left(view: View) -> View:
+    """Return what a film shows whose images were turned by a quarter, as those of a telephone held upright."""
+    uv_px = np.column_stack([view.features.uv_px[:, 1], SIZE_PX[0] - view.features.uv_px[:, 0]])
+    return replace(view, features=replace(view.features, uv_px=uv_px, uv_rect_px=uv_px))
+
+
+@pytest.mark.parametrize("seed", first_of([0, 1]))
+def test_an_upright_image_is_read_column_by_column(seed: int) -> None:
+    world = PointWorld(cloud(seed=seed), shaken(120), seed=seed)
+    width, height = SIZE_PX
+    (fx, fy), (cx, cy) = np.diag(CAMERA.K)[:2], CAMERA.K[:2, 2]
+    camera = PinholeCamera(height, width, fy, fx, cy, width - cx)
+    shutter = RollingShutter(OrbFrontend(), CameraConfig(), 0)
+    views = [turned_left(read_row_by_row(world, i, READOUT_S)) for i in range(120)]
+    for view in views:
+        shutter.may_start(shutter.shutter_corrected(view, camera), camera)
+    assert shutter.readout_s == pytest.approx(READOUT_S, abs=0.005)
+    straight = shutter.all_corrected(views[40:60], camera)[5].features.uv_rect_px
+    true = turned_left(read_row_by_row(world, 45, 0.0)).features.uv_rect_px
+    apart = np.linalg.norm(straight[:, None] - true[None], axis=2).min(axis=1)
+    assert np.median(apart) < 1.0
 
 
 @pytest.mark.parametrize("dropped", [(), (7, 8), (20, 41, 42, 43, 77), tuple(range(5, 160, 11))], ids=str)
