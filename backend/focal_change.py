@@ -94,9 +94,9 @@ def _largest_change(parts: Sequence[_Part]) -> FocalChange | None:
     if len(parts) < 2:
         return None
     information = np.array([1.0 / part.variance for part in parts])
-    told = np.cumsum(information)
+    known = np.cumsum(information)
     said = np.cumsum(information * np.array([part.focal for part in parts]))
-    before, after = told[:-1], told[-1] - told[:-1]
+    before, after = known[:-1], known[-1] - known[:-1]
     change = (said[-1] - said[:-1]) / after - said[:-1] / before
     sigma = np.sqrt(1.0 / before + 1.0 / after)
     n = int(np.argmax(np.abs(change) / sigma))

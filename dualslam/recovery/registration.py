@@ -71,8 +71,8 @@ class Registration:
     # --- steps
 
     def _grow(self) -> None:
-        due, n_adjusted = set(self.views), self._adjust_all()
-        n_asked = n_adjusted
+        due = set(self.views)
+        n_asked = n_adjusted = self._adjust_all()
         while len(self.submap.keyframes) < MAX_KEYFRAMES:
             for i in sorted(due):
                 self._ask(i)
@@ -81,8 +81,8 @@ class Registration:
             if best is None:
                 if len(self.submap.keyframes) == n_asked:
                     return
-                due, n_adjusted = set(self.views), self._adjust_all()
-                n_asked = n_adjusted
+                due = set(self.views)
+                n_asked = n_adjusted = self._adjust_all()
                 self._repeated.clear()  # the map shows more now, by which two poses differ
                 continue
             # The map has grown, or was adjusted, since the frame was posed.

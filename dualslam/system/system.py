@@ -330,10 +330,7 @@ class System:
             link_overlaps(state.record, self._connections, state.config, own, last)
             if self._registers:
                 self._registering.finish(last)
-            with self.timer.measure("calibration"):
-                found = state.parts.find_focal_change(maps, self.camera)
-            if found is not None:
-                state.record.event(EventKind.FOCAL_CHANGED, self.rows[found.keyframe_id], **found.numbers)
+            self._calibrations.look_for_zoom(maps)
         self.buffer.clear()  # nothing walks through it any more, and refinement needs the memory
         shapes = {} if interrupted or state.localises else self._endings.refine()
         if last is not None:

@@ -44,6 +44,7 @@ class Calibrations:
         self._calibration, self._new_graph = state.parts.calibration, state.parts.new_graph
         self._recoveries, self._connections = recoveries, connections
         self._ask_together = state.parts.calibrate_together
+        self._find_focal_change = state.parts.find_focal_change
 
     def ask_if_due(self, live: VisualOdometry, now: FrameStamp) -> None:
         """Ask the live submap about its camera where it is time to."""
@@ -99,6 +100,13 @@ class Calibrations:
                 self._change(submap, after, now)
                 self._record.change_pixels(submap.id, lambda _: rectified)
         self._record.event(EventKind.CALIBRATED, now, lost=[], **estimate.numbers)
+
+    def look_for_zoom(self, submaps: list[Submap]) -> None:
+        """Note where the focal length changes during the run, if it does; the maps stay as they are."""
+        with self._record.timer.measure("calibration"):
+            found = self._find_focal_change(submaps, self._calibration.camera)
+        if found is not None:
+            self._record.event(EventKind.FOCAL_CHANGED, self._record.rows[found.keyframe_id], **found.numbers)
 
     def _is_waited_for(self, live: VisualOdometry) -> bool:
         """Whether a lost map is to be joined to the live one."""
