@@ -255,9 +255,7 @@ def share_landmarks(submap: Submap, matches: Collection[tuple[int, int, IntArray
 
     Returns int: how many pairs of features have come to see one landmark.
     """
-    named = [
-        submap.landmark_of[k][feature] for a, b, pairs in matches for k, feature in zip((a, b), pairs.T, strict=True)
-    ]
+    named = [submap.landmark_of[k][own] for a, b, pairs in matches for k, own in zip((a, b), pairs.T, strict=True)]
     obs, rows = submap.observations, submap.rows_of_landmarks(np.concatenate([np.zeros(0, np.int64), *named]))
     seen_in: dict[int, set[int]] = {}
     for landmark, k in zip(obs["landmark"][rows].tolist(), obs["kf"][rows].tolist(), strict=True):

@@ -43,8 +43,7 @@ class Calibrations:
         self._record, self._buffer = state.record, state.buffer
         self._calibration, self._new_graph = state.parts.calibration, state.parts.new_graph
         self._recoveries, self._connections = recoveries, connections
-        self._ask_together = state.parts.calibrate_together
-        self._find_focal_change = state.parts.find_focal_change
+        self._ask_together, self._find_zoom = state.parts.calibrate_together, state.parts.find_focal_change
 
     def ask_if_due(self, live: VisualOdometry, now: FrameStamp) -> None:
         """Ask the live submap about its camera where it is time to."""
@@ -104,7 +103,7 @@ class Calibrations:
     def look_for_zoom(self, submaps: list[Submap]) -> None:
         """Note where the focal length changes during the run, if it does; the maps stay as they are."""
         with self._record.timer.measure("calibration"):
-            found = self._find_focal_change(submaps, self._calibration.camera)
+            found = self._find_zoom(submaps, self._calibration.camera)
         if found is not None:
             self._record.event(EventKind.FOCAL_CHANGED, self._record.rows[found.keyframe_id], **found.numbers)
 
