@@ -15,6 +15,8 @@ MIN_CONSENSUS = 12
 """Matches below which a RANSAC consensus of a 3-point solver is no evidence."""
 START_POINTS = 50
 """Points of two views that a map starts from, at least, as they are left after the first bundle adjustment."""
+PAIR_MATCHES = round(1.2 * START_POINTS)
+"""Matches of two views below which no relative pose is estimated: a sixth of them may be wrong."""
 MIN_DEPTH_MU = 1e-3
 """Nearer points count as behind the camera, shorter baselines as none. A submap's median depth is 1 at first."""
 MAX_DEPTH_SIGMA = 0.25

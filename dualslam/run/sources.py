@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -21,7 +21,9 @@ from dualslam.io.reduced import MAX_SIDE_PX
 from dualslam.io.sequence import RecordedSequence, Selection
 from dualslam.io.trajectory_files import Trajectory
 from dualslam.io.video import is_live
-from dualslam.lab.synthetic import SyntheticSequence, make_sequence, parse_events
+
+if TYPE_CHECKING:
+    from dualslam.lab.synthetic import SyntheticSequence
 
 SYNTHETIC = "synthetic:"
 WORLD_NUMBERS = {"frames": 300, "seed": 0, "width": 640, "height": 480, "visit": 0, "backwards": 0}
@@ -178,6 +180,8 @@ def make_world(
 
     Raises `InputError`.
     """
+    from dualslam.lab.synthetic import make_sequence  # a renderer, which recordings do without
+
     try:
         return make_sequence(name, n_frames, seed, width, height, events, **visit)
     except ConfigError as error:
@@ -189,6 +193,8 @@ def read_script(path: str | Path) -> list[Mapping[str, Any]]:
 
     Raises `InputError`.
     """
+    from dualslam.lab.synthetic import parse_events
+
     try:
         items = strict_yaml.loads(Path(path).read_text(encoding="utf-8"))
         if not isinstance(items, list):

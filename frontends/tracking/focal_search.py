@@ -24,14 +24,13 @@ from dualslam.core.geometry import se3
 from dualslam.core.geometry.distortion import division_area_ratio, undistort_division
 from dualslam.core.geometry.two_view import fundamental_from_pose, sampson_error
 from dualslam.core.interfaces import Frontend
-from dualslam.core.noise_model import GATE_SIGMAS, INFLATION
+from dualslam.core.noise_model import GATE_SIGMAS, INFLATION, PAIR_MATCHES
 from dualslam.core.types import Failure, FailureReason, Features, FloatArray
 from dualslam.frontends.tracking.resection import poselib_camera
 
 LAGS = (1, 2, 5, 10, 20, 40)
 """Frames between the two of a pair: a car at 10 Hz loses sight of most points within five."""
 MAX_PAIRS, MIN_PAIRS = 30, 8
-MIN_MATCHES = 60
 MAX_MATCHES = 200
 """Of a pair, for time's sake."""
 MIN_MOTION, MAX_MOTION = 0.01, 0.15
@@ -166,7 +165,7 @@ def _find_pairs(
                 break
             a, b = features[first], features[first + lag]
             index = frontend.match_wide(a, b).index
-            if len(index) < MIN_MATCHES:
+            if len(index) < PAIR_MATCHES:
                 continue
             uv_a, uv_b = a.uv_px[index[:, 0]], b.uv_px[index[:, 1]]
             motion = float(np.median(np.linalg.norm(uv_a - uv_b, axis=1))) / max(size_px)
@@ -180,7 +179,7 @@ def _find_pairs(
         options = {"max_epipolar_error": GATE_SIGMAS * sigma, "max_iterations": 300, "min_iterations": 50, "seed": seed}
         inlier = np.array(poselib.estimate_fundamental(uv_a, uv_b, options, {})[1]["inliers"], bool)
         chosen = rng.permutation(np.flatnonzero(inlier))[:MAX_MATCHES]
-        if len(chosen) >= MIN_MATCHES:
+        if len(chosen) >= PAIR_MATCHES:
             yield _Pair(uv_a[chosen] - middle, uv_b[chosen] - middle, sigma, max(size_px) / 2)
 
 

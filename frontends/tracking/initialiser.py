@@ -21,14 +21,12 @@ from dualslam.core.decisions import Gate
 from dualslam.core.geometry import se3
 from dualslam.core.geometry.triangulation import triangulate_two_view
 from dualslam.core.interfaces import START_REACH, Frontend
-from dualslam.core.noise_model import GATE_SIGMAS, PROOF_VIEWS, START_POINTS, TINY
+from dualslam.core.noise_model import GATE_SIGMAS, PAIR_MATCHES, PROOF_VIEWS, START_POINTS, TINY
 from dualslam.core.types import Failure, FailureReason, Features, FloatArray, Matches, Start, View
 from dualslam.frontends.features.motion_statistics import match_by_motion, nearest_search
 from dualslam.frontends.tracking.start_proof import StartProof, ViewPair, direction_angle_deg, direction_sigma_deg
 from dualslam.frontends.tracking.two_view_hypotheses import RelativePoses
 
-MIN_MATCHES = round(1.2 * START_POINTS)
-"""Matches between the two views below which no model is tried: a sixth of them may be wrong."""
 MIN_PARALLAX_DEG = 1.0
 """Angle under which the two cameras must see half as many points as `START_POINTS`, after the rotation is taken out.
 However many more are far away: on a road most are, and the near ones fix the motion."""
@@ -89,8 +87,8 @@ class Initialiser:
         self.collect(view)
         lenience = float(np.clip(waited_s / PATIENCE_S, 1.0, MAX_LENIENCE))
         best = Failure(FailureReason.TOO_FEW_MATCHES, "one view")
-        if len(view.features) < MIN_MATCHES:
-            gate = Gate("features", len(view.features), ">=", MIN_MATCHES)
+        if len(view.features) < PAIR_MATCHES:
+            gate = Gate("features", len(view.features), ">=", PAIR_MATCHES)
             return Failure(FailureReason.NO_TEXTURE, f"{len(view.features)} features in the image", gates=(gate,))
         farthest = sum(lag < len(self._views) for lag in LAGS) - 1
         for _ in range(1 if briefly else MAX_PAIRS):
@@ -125,9 +123,9 @@ class Initialiser:
         """
         a, b = self._views[first], self._views[last]
         matches = self._match(a.features, b.features)
-        if len(matches) < MIN_MATCHES:
-            gate = Gate("matches", len(matches), ">=", MIN_MATCHES)
-            detail = f"{len(matches)} matches, {MIN_MATCHES} needed"
+        if len(matches) < PAIR_MATCHES:
+            gate = Gate("matches", len(matches), ">=", PAIR_MATCHES)
+            detail = f"{len(matches)} matches, {PAIR_MATCHES} needed"
             return Failure(FailureReason.TOO_FEW_MATCHES, detail, gates=(gate,))
         pair = self._best_pose(a, b, matches)
         start = (

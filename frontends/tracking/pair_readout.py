@@ -10,9 +10,8 @@ from dualslam.core.chi_square import CHI2_95
 from dualslam.core.geometry import se3
 from dualslam.core.geometry.two_view import fundamental_from_pose, sampson_error
 from dualslam.core.interfaces import Frontend
-from dualslam.core.noise_model import GATE_SIGMAS, INFLATION, TINY
+from dualslam.core.noise_model import GATE_SIGMAS, INFLATION, PAIR_MATCHES, TINY
 from dualslam.core.types import Features, FloatArray, View
-from dualslam.frontends.tracking.focal_search import MIN_MATCHES
 from dualslam.frontends.tracking.resection import poselib_camera
 from dualslam.frontends.tracking.turning import at_middle
 
@@ -78,7 +77,7 @@ class ReadoutEstimator:
         if not (is_fast(rate_a, camera) or is_fast(rate_b, camera)):
             return None
         matches = self._frontend.match_wide(a.features, b.features)
-        if len(matches) < MIN_MATCHES:
+        if len(matches) < PAIR_MATCHES:
             return None
         of_a, of_b = a.features.take(matches.index[:, 0]), b.features.take(matches.index[:, 1])
         misfits, turned = self._misfits(of_a, rate_a, of_b, rate_b, camera)

@@ -247,6 +247,12 @@ def test_importing_everything_public_leaves_extras_alone() -> None:
     assert not {"torch", "kornia", "matplotlib", "pandas", "rerun"} & set(done.stdout.split())
 
 
+def test_a_run_on_a_recording_loads_neither_renderer_nor_optimiser() -> None:
+    code = "import sys, dualslam.build, dualslam.run.session; print(*sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert not {"dualslam.lab.synthetic", "scipy.optimize"} & set(done.stdout.split())
+
+
 def test_limit_threads_leaves_what_the_user_has_set() -> None:
     code = (
         "import os; from dualslam import limit_threads; early = limit_threads(); import numpy;"
