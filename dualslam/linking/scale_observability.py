@@ -119,9 +119,36 @@ def normal_equations(submap: Submap, excess: Mapping[int, float]) -> NormalEquat
     return _linearise(_ask_all(submap, [(ids, ids)], excess))
 
 
-def _ask_all(submap: Submap, places: Sequence[tuple[IntArray, IntArray]], excess: Mapping[int, float]) -> ScaleQuestion:
-    """Ask all that a submap has seen, each keyframe with its own noise."""
-    question = ask_scale(submap, places, n_around=len(submap.keyframes))
+def spread_by_poses(
+    submap: Submap, keyframe_ids: IntArray, landmark_ids: IntArray, by_point: FloatArray, excess: Mapping[int, float]
+) -> FloatArray:
+    """Return the covariance (D, D) of something that depends on landmarks, by the errors of the poses they follow.
+
+    What a few keyframes see follows their poses all alike. It does not average out over the landmarks.
+
+    - `keyframe_ids`: that see the landmarks. `N_AROUND` keyframes before and after them count as well.
+    - `by_point` (N, D, 3): derivatives by the landmarks `landmark_ids` (N,).
+    - `excess`: of `noise_excess`.
+    """
+    problem = _linearise(_ask_all(submap, [(keyframe_ids, keyframe_ids)], excess, N_AROUND))
+    assert problem is not None, "landmarks are seen twice"
+    row = np.searchsorted(problem.landmarks, landmark_ids).clip(0, len(problem.landmarks) - 1)
+    known = problem.landmarks[row] == landmark_ids
+    g = np.zeros((by_point.shape[1], *problem.xyz.shape))
+    g[:, row[known]] = by_point[known].transpose(1, 0, 2)
+    _, root = _directions(problem.reduced)
+    by_pose = np.array([_by_poses(problem, np.zeros(len(problem.reduced)), each) for each in g]) @ root
+    return np.asarray(SCALE_INFLATION**2 * COVARIANCE_INFLATION * by_pose @ by_pose.T)
+
+
+def _ask_all(
+    submap: Submap,
+    places: Sequence[tuple[IntArray, IntArray]],
+    excess: Mapping[int, float],
+    n_around: int | None = None,
+) -> ScaleQuestion:
+    """Ask all that a submap has seen, or `n_around` keyframes about the places, each keyframe with its own noise."""
+    question = ask_scale(submap, places, len(submap.keyframes) if n_around is None else n_around)
     noise = np.array([excess[k] for k in question.ids.tolist()])[question.kf]
     return replace(question, sigma_px=noise * question.sigma_px)
 

@@ -7,7 +7,7 @@ do not. What is believed becomes a link, and the atlas does the rest.
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from dualslam.atlas.atlas import Link, LinkKind
 from dualslam.atlas.connections import Connections
@@ -166,6 +166,21 @@ class Revisits:
             link = self._link_of(found.match)
             report = self._connections.connect([link], now)
             self._linked(_Found(found.match, found.confirmations, kind=link.kind), report, None, now)
+
+    def measure_again(self, refined: Collection[int]) -> None:
+        """Measure the links of places again where a submap was refined since: the first time it was young."""
+        atlas, verifier = self._record.atlas, self._parts.verifier
+        for i, link in enumerate(atlas.links):
+            if link.kind not in (LinkKind.LOOP, LinkKind.MERGE) or not {link.a, link.b} & set(refined):
+                continue
+            k_a, k_b = link.attached(atlas)
+            a, b = atlas.submaps[link.a], atlas.submaps[link.b]
+            match = verifier.verify((b, k_b), (a, k_a))
+            if isinstance(match, Failure) or match.doubt is not None:
+                continue
+            if agree(atlas, replace(match, S_place_query=link.S_a_b), match):
+                match = verifier.with_errors_of_poses(match, a, b)
+                atlas.links[i] = replace(link, S_a_b=match.S_place_query, covariance=match.covariance)
 
     def _take_answers(self, answers: Iterable[Ended], live: VisualOdometry | None, now: FrameStamp) -> None:
         for ended in answers:

@@ -15,14 +15,14 @@ do not.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.random import Generator
 
 from dualslam.core.config.settings import LinkingConfig
 from dualslam.core.geometry import se3, sim3, so3
-from dualslam.core.geometry.alignment import Sim3Estimate, estimate_sim3_robust
+from dualslam.core.geometry.alignment import Sim3Estimate, estimate_sim3_robust, sensitivity
 from dualslam.core.interfaces import Frontend
 from dualslam.core.matchers import Look, Sighting
 from dualslam.core.noise_model import MAJORITY, MIN_CONSENSUS, PROOF_VIEWS
@@ -39,7 +39,8 @@ from dualslam.linking.join_test import (
     similarity_gates,
     support_gate,
 )
-from dualslam.map.landmark_views import landmark_covariances
+from dualslam.linking.scale_observability import spread_by_poses
+from dualslam.map.landmark_views import landmark_covariances, noise_excess
 from dualslam.map.submap import Submap
 from dualslam.places.sides import (
     Looks,
@@ -137,6 +138,18 @@ class PlaceVerifier:
         own = self._own_found(place)
         numbers = {"own_found": own, "n_visible": float(len(look.feature))}
         return LinkEvidence.of([_found_gate(look.share, own)]).refusal(numbers)
+
+    def with_errors_of_poses(self, match: PlaceMatch, place: Submap, query: Submap) -> PlaceMatch:
+        """Return a match of two submaps with what the poses of their keyframes add to its covariance."""
+        pairs = self._place_pairs(place, query, *match.landmark_pairs.T)
+        by_place = sensitivity(match.S_place_query, pairs.xyz_query, pairs.xyz_place, pairs.cov_query, pairs.cov_place)
+        covariance = match.covariance
+        for submap, keyframes, ids, by_point in (
+            (place, match.keyframes_place, pairs.place, by_place),
+            (query, match.keyframes_query, pairs.query, -by_place @ match.S_place_query[:3, :3]),
+        ):
+            covariance = covariance + spread_by_poses(submap, np.array(keyframes), ids, by_point, noise_excess(submap))
+        return replace(match, covariance=covariance)
 
     # --- steps
 

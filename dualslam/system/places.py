@@ -107,6 +107,11 @@ class PlaceKeeping:
         with self._state.record.timer.measure("places"):
             self._revisits.join_rest(own, now)
 
+    def measure_again(self, refined: Collection[int]) -> None:
+        """Measure the links of places again in submaps that are `refined`."""
+        with self._state.record.timer.measure("places"):
+            self._revisits.measure_again(refined)
+
     # --- a place that an earlier run has mapped
 
     def keyframe_waits(self, odometry: VisualOdometry, track: Track) -> bool:

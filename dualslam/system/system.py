@@ -334,6 +334,7 @@ class System:
         self.buffer.clear()  # nothing walks through it any more, and refinement needs the memory
         shapes = {} if interrupted or state.localises else self._endings.refine()
         if last is not None:
+            self._places.measure_again(shapes.keys())
             self._connections.settle(last)
             self._endings.pose_frames_anew(shapes)
             self._endings.part_what_lost_its_scale(last)

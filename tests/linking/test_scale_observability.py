@@ -9,7 +9,8 @@ import pytest
 
 from dualslam.backend.submap_graph import ISam2SubmapGraph
 from dualslam.core.config.settings import GraphConfig, LinkingConfig
-from dualslam.core.geometry import se3
+from dualslam.core.geometry import se3, sim3
+from dualslam.core.geometry.alignment import estimate_sim3_robust, sensitivity
 from dualslam.core.noise_model import GATE_SIGMAS
 from dualslam.core.types import Failure, FailureReason, FloatArray, IntArray
 from dualslam.linking import (
@@ -28,8 +29,10 @@ from dualslam.linking.scale_observability import (
     relative_scales,
     scale_sigma_between,
     scale_sigmas_in_all,
+    spread_by_poses,
 )
 from dualslam.linking.verify import judge_parting
+from dualslam.map.landmark_views import landmark_covariances
 from dualslam.map.submap import Submap
 from dualslam.map.submap_change import solve
 from dualslam.testing.link_worlds import (
@@ -49,7 +52,7 @@ from dualslam.testing.link_worlds import (
 CONFIG = LinkingConfig()
 MATCHER = DescriptorMatcher(hamming, 64.0)
 N = 24
-HERE, THERE = FRAME_STEP * np.arange(4), FRAME_STEP * np.arange(20, 24)
+HERE, MIDDLE, THERE = FRAME_STEP * np.arange(4), FRAME_STEP * np.arange(10, 14), FRAME_STEP * np.arange(20, 24)
 EXACT = dict.fromkeys((FRAME_STEP * np.arange(N)).tolist(), 1.0)
 
 
@@ -92,6 +95,34 @@ def test_the_sigma_is_that_of_the_error(layout: str) -> None:
         of_path.append(error / relative_scales(submap, [HERE, THERE], [], EXACT)[0, 1])
     assert 0.2 < np.sqrt(np.mean(np.square(of_depths))) < 2.0, of_depths
     assert 0.2 < np.sqrt(np.mean(np.square(of_path))) < 2.0, of_path
+
+
+def scale_by_points(layout: str, seed: int) -> tuple[float, float, float]:
+    """Return the error of the log of a map's scale by the points of one place against the truth; its claims."""
+    world, submap = solved(layout, seed)
+    ids, points = [], []
+    for k in MIDDLE.tolist():
+        point_of = {int(i): p for p, i in enumerate(world.feature_of[k // FRAME_STEP].tolist()) if i >= 0}
+        feature = np.flatnonzero(submap.landmark_of[k] >= 0)
+        ids.append(submap.landmark_of[k][feature])
+        points += [point_of[i] for i in feature.tolist()]
+    seen, first = np.unique(np.concatenate(ids), return_index=True)
+    src, dst = submap.landmarks["xyz_mu"][seen], world.xyz[np.array(points)[first]]
+    cov_src, cov_dst = landmark_covariances(submap, seen), np.tile(1e-10 * np.eye(3), (len(seen), 1, 1))
+    found = estimate_sim3_robust(src, dst, cov_src, cov_dst, np.random.default_rng(0))
+    assert not isinstance(found, Failure)
+    S, i = found.S_dst_src, found.inliers
+    by_src = -sensitivity(S, src[i], dst[i], cov_src[i], cov_dst[i]) @ S[:3, :3]
+    by_poses = spread_by_poses(submap, MIDDLE, seen[i], by_src, EXACT)
+    error = float(np.log(sim3.scale(S))) + log_size(world, submap, np.array(sorted(submap.keyframes)))
+    points_only = float(found.covariance[6, 6])
+    return error, float(np.sqrt(points_only)), float(np.sqrt(points_only + by_poses[6, 6]))
+
+
+def test_points_of_a_place_err_alike_with_the_poses_that_they_follow() -> None:
+    error, by_points, with_poses = np.array([scale_by_points("room", seed) for seed in range(4)]).T
+    assert np.sqrt(np.mean((error / by_points) ** 2)) > 5.0
+    assert 0.2 < np.sqrt(np.mean((error / with_poses) ** 2)) < 2.0
 
 
 def test_the_way_can_be_unsure_where_the_depths_are_firm() -> None:

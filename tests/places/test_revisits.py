@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from functools import cache
 from operator import attrgetter
 
@@ -11,6 +12,7 @@ import pytest
 
 from dualslam.atlas.atlas import LinkKind
 from dualslam.core.events import Event, EventKind
+from dualslam.core.geometry import sim3
 from dualslam.core.jobs import Ended, InlineDesk, JobKind
 from dualslam.core.types import Failure, FailureReason, FloatArray, FrameStatus
 from dualslam.linking.join_test import drift_gate
@@ -138,6 +140,19 @@ def test_maps_that_share_no_frame_are_merged_by_sight() -> None:
     assert main.index[-1] == N + 11
     size = np.linalg.norm(np.ptp(ring(N)[:, :3, 3], axis=0))
     assert pose_errors(main.T_world_cam, ring(N + 12)[main.index])[0].max() < 0.05 * size
+
+
+def test_the_link_of_a_place_is_measured_again_in_refined_maps() -> None:
+    """The first time one side was young: its scale was 8 % off."""
+    system = two_maps()
+    links = system.atlas.links
+    row = next(i for i, link in enumerate(links) if link.kind is LinkKind.MERGE)
+    link = links[row]
+    centre = system.atlas.submaps[link.b].T_submap_kf[link.keyframe_b][:3, 3]
+    links[row] = replace(link, S_a_b=link.S_a_b @ sim3.from_parts(1.08, np.eye(3), -0.08 * centre))
+    system.finish()
+    assert links[row].attached_as(link)
+    assert float(sim3.scale(links[row].S_a_b) / sim3.scale(link.S_a_b)) == pytest.approx(1.0, abs=0.03)
 
 
 @pytest.mark.slow

@@ -76,6 +76,13 @@ class _Sim3Problem:
         gradient has the Jacobian at x. With the Jacobian at src and the covariance held, the scale is biased and
         swapping the maps does not invert the estimate. (Errors in variables, regression dilution.)
         """
+        J, WJ, residual = self.linearise(S, weight)
+        WJ = WJ.reshape(-1, 7)
+        H = J.reshape(-1, 7).T @ WJ
+        return 0.5 * (H + H.T), WJ.T @ residual.reshape(-1)
+
+    def linearise(self, S: FloatArray, weight: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return the Jacobians (N, 3, 7), the same times the pairs' information, and the residuals (N, 3)."""
         A = S[:3, :3]
         residual = self.dst - (self.src @ A.T + S[:3, 3])
         covariance = self.cov_dst + A @ self.cov_src @ A.T
@@ -89,9 +96,20 @@ class _Sim3Problem:
         J[:, :, :3] = A @ so3.hat(-x)
         J[:, :, 3:6] = A
         J[:, :, 6] = x @ A.T
-        WJ = (information @ J).reshape(-1, 7)
-        H = J.reshape(-1, 7).T @ WJ
-        return 0.5 * (H + H.T), WJ.T @ residual.reshape(-1)
+        return J, information @ J, residual
+
+
+def sensitivity(
+    S_dst_src: FloatArray, src: FloatArray, dst: FloatArray, cov_src: FloatArray, cov_dst: FloatArray
+) -> FloatArray:
+    """Return the derivatives (N, 7, 3) of an estimated similarity, as xi in ``S_dst_src @ exp(xi)``, by points of dst.
+
+    Arguments as for `estimate_sim3_robust`: its inliers. By points of src they are these times ``-s R``.
+    """
+    problem = _Sim3Problem(src, dst, cov_src, cov_dst)
+    J, WJ, _ = problem.linearise(S_dst_src, np.ones(len(src)))
+    H = np.einsum("nia,nib->ab", J, WJ)
+    return np.asarray(np.linalg.solve(H, WJ.transpose(0, 2, 1)))
 
 
 def estimate_sim3_robust(
