@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from dualslam.backend.submap_graph import ISam2SubmapGraph
-from dualslam.backend.window import NumpyWindowSolver
+from dualslam.backend.window import NumpyWindowSolver, _evaluate, _window, adjust_window
 from dualslam.core.config.settings import GraphConfig
 from dualslam.core.geometry import se3
 from dualslam.core.types import Failure
@@ -88,3 +88,21 @@ def test_without_others_that_hold_it_there_is_no_window() -> None:
         rows = np.flatnonzero((submap.observations["kf"] == other) & submap.observations["alive"])
         submap.remove_observations(rows)
     assert isinstance(solver()(submap, newest(submap)), Failure)
+
+
+def test_points_and_poses_against_a_dense_least_squares_step() -> None:
+    """The Schur complement is the same as the whole normal equations: the gradient vanishes at the optimum found."""
+    feeder, _, _ = one_more(noise_px=0.5)
+    submap = feeder.submap
+    free = newest(submap)
+    _, _, window = _window(submap, free, submap.landmarks_of_keyframes(free[:1]))
+    best = adjust_window(window, 1.345, iterations=60)
+    for f in range(len(free)):
+        for axis in range(6):
+            costs = []
+            for h in (1e-5, -1e-5):
+                T = best.T.copy()
+                T[f] = T[f] @ se3.exp(h * np.eye(6)[axis])
+                costs.append(_evaluate(window, T, best.xyz, 1.345).cost)
+            curvature = (sum(costs) - 2 * best.cost) / 1e-10
+            assert abs(costs[0] - costs[1]) / 2e-5 < 2e-2 * np.sqrt(curvature)
