@@ -17,7 +17,7 @@ from dualslam.core.camera.corrected import LensCorrection
 from dualslam.core.chi_square import MEDIAN_CHI2
 from dualslam.core.errors import SolverError
 from dualslam.core.noise_model import MAX_TRIES, MIN_DEPTH_MU, TINY
-from dualslam.core.types import FloatArray, IntArray
+from dualslam.core.types import FloatArray
 
 MAX_ITERATIONS = 100
 """Most need a few. Where the focal length is far off, the way is long and bent: lens and focal length make up for each
@@ -52,11 +52,11 @@ class CorrectedLens:
     def __init__(self, K: FloatArray, information: FloatArray) -> None:
         self.K, self.information = K, information
 
-    def project(self, xy: FloatArray, parameters: FloatArray, rows: IntArray) -> FloatArray:
+    def project(self, xy: FloatArray, parameters: FloatArray) -> FloatArray:
         """Return the pixels (R, 2) of rays (x, y, 1), (R, 2)."""
         return LensCorrection.of_vector(parameters).distort_px(self.K, xy)
 
-    def derivatives(self, xy: FloatArray, parameters: FloatArray, rows: IntArray) -> tuple[FloatArray, FloatArray]:
+    def derivatives(self, xy: FloatArray, parameters: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return how pixels change with the rays (R, 2, 2) and with the parameters (R, 2, 5)."""
         k1, k2 = parameters[3:]
         focal = math.exp(parameters[0]) * np.array([self.K[0, 0], self.K[1, 1]])
@@ -79,11 +79,11 @@ class _HeldLens(CorrectedLens):
         super().__init__(K, np.zeros((0, 0)))
         self._parameters = parameters
 
-    def project(self, xy: FloatArray, parameters: FloatArray, rows: IntArray) -> FloatArray:
-        return super().project(xy, self._parameters, rows)
+    def project(self, xy: FloatArray, parameters: FloatArray) -> FloatArray:
+        return super().project(xy, self._parameters)
 
-    def derivatives(self, xy: FloatArray, parameters: FloatArray, rows: IntArray) -> tuple[FloatArray, FloatArray]:
-        by_ray, by_lens = super().derivatives(xy, self._parameters, rows)
+    def derivatives(self, xy: FloatArray, parameters: FloatArray) -> tuple[FloatArray, FloatArray]:
+        by_ray, by_lens = super().derivatives(xy, self._parameters)
         return by_ray, by_lens[:, :, :0]
 
 

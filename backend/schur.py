@@ -43,11 +43,11 @@ class Lens(Protocol):
 
     information: FloatArray  # (M, M), of the prior
 
-    def project(self, xy: FloatArray, parameters: FloatArray, rows: IntArray) -> FloatArray:
-        """Return the pixels (R, 2) of rays (x, y, 1), (R, 2); `rows` (R,): the observations that they are of."""
+    def project(self, xy: FloatArray, parameters: FloatArray) -> FloatArray:
+        """Return the pixels (R, 2) of rays (x, y, 1), (R, 2)."""
         ...
 
-    def derivatives(self, xy: FloatArray, parameters: FloatArray, rows: IntArray) -> tuple[FloatArray, FloatArray]:
+    def derivatives(self, xy: FloatArray, parameters: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return how pixels change with the rays (R, 2, 2) and with the parameters (R, 2, M)."""
         ...
 
@@ -196,7 +196,7 @@ class System:
         xyz_cam, front, uv_px = reproject(p.K, state.T_submap_kf, p.kf[rows], state.xyz_mu.take(p.point[rows], axis=0))
         xyz_cam = np.where(front[:, None], xyz_cam, [0.0, 0.0, 1.0])
         if self._lens is not None:
-            uv_px = self._lens.project(xyz_cam[:, :2] / xyz_cam[:, 2:], state.lens, rows)
+            uv_px = self._lens.project(xyz_cam[:, :2] / xyz_cam[:, 2:], state.lens)
         residuals = (uv_px - p.uv_px[rows]) / p.sigma_px[rows, None]
         chi2 = np.where(front, np.einsum("ri,ri->r", residuals, residuals), BEHIND_CHI2)
         weight, losses = self._loss(chi2)
@@ -215,7 +215,7 @@ class System:
             J_lens = np.zeros((len(rows), 2, 0))
         else:
             xy, z = xyz_cam[:, :2] / xyz_cam[:, 2:], xyz_cam[:, 2]
-            by_ray, by_lens = self._lens.derivatives(xy, state.lens, rows)
+            by_ray, by_lens = self._lens.derivatives(xy, state.lens)
             by_ray = by_ray / (z * sigma_px)[:, None, None]
             J_cam = np.concatenate((by_ray, -(by_ray @ xy[:, :, None])), axis=2)
             J_point, J_lens = J_cam @ R.transpose(0, 2, 1), by_lens / sigma_px[:, None, None]

@@ -6,7 +6,6 @@ from collections.abc import Callable
 from functools import partial
 
 from dualslam.atlas.beside import atlas_handlers
-from dualslam.backend.readout import answer_readout
 from dualslam.build.parts import atlas_solver, graph_maker, new_calibration, new_initialiser, place_parts
 from dualslam.build.walks import FEATURE_THREADS, recovery_parts
 from dualslam.core.camera.base import Camera
@@ -17,6 +16,7 @@ from dualslam.core.resources import spare_cores
 from dualslam.core.types import Failure, Frame
 from dualslam.core.walk_news import WalkWatch
 from dualslam.frontends.registry import create_frontend
+from dualslam.frontends.tracking.map_readout import answer_readout
 from dualslam.lab.disturbances import FaultScript
 from dualslam.map.graph_beside import GraphServer
 from dualslam.map.lens import CalibrationAnswer, CalibrationJob, answer

@@ -25,14 +25,6 @@ class BundleProblem:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class ReadoutProblem:
-    """Keyframes whose images were read line by line: how long that took is one more unknown."""
-
-    bundle: BundleProblem
-    by_readout: FloatArray  # (R, 2): by how much each pixel moves with a second of readout
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class FrameRows:
     """Observations of a submap by frames that are no keyframes."""
 

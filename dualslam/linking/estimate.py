@@ -309,8 +309,8 @@ def _fit(model: PairModel, used: BoolArray, config: LinkingConfig, rng: Generato
     estimate = estimate_sim3_robust(
         c.xyz_new[rows],
         c.xyz_old[rows],
-        model.points.cov_src[rows],
-        model.points.cov_dst[rows],
+        model.covariance_new[rows],
+        model.covariance_old[rows],
         rng,
         min_inliers=config.min_inliers,
         max_hypotheses=MAX_HYPOTHESES,

@@ -14,15 +14,16 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy import sparse
 from scipy.spatial.distance import cdist
 
+from dualslam.core.arrays import sum_by
 from dualslam.core.geometry import se3
 from dualslam.core.geometry.alignment import COVARIANCE_INFLATION
-from dualslam.core.geometry.normal_equations import SLACK, NormalEquations, eliminate_points
+from dualslam.core.geometry.projection import project_points, projection_jacobians
 from dualslam.core.noise_model import GROUP, TINY
 from dualslam.core.types import FloatArray, IntArray
 from dualslam.linking.join_test import PIXEL_CHI2
-from dualslam.linking.pairs import pixel_chi2
 from dualslam.map.submap import Submap
 
 N_AROUND = 2 * GROUP
@@ -32,6 +33,8 @@ SCALE_INFLATION = 1.8
 is true comes to what is claimed on plain stretches (`benchmarks/covariances.py`, seeds 1 to 3)."""
 N_GAUGE = 7
 """Directions of the poses that no observation fixes: a similarity of the whole."""
+SLACK = 1e-12
+"""Relative to a block of the normal equations: what keeps a point without parallax from being singular."""
 NO_TIE = 1e-7
 """Relative to the median stiffness: directions that are softer than this are as free as the gauge."""
 
@@ -76,9 +79,9 @@ def relative_scales(
     problem, n = normal_equations(submap, excess), len(stretches) + len(places)
     if problem is None:
         return np.where(np.eye(n, dtype=bool), 0.0, np.inf)
-    free, root = _directions(problem.equations.reduced)
-    seen = [problem.log_depth(place) for place in places]
-    by_points = [np.full(len(root), np.nan) if each is None else problem.equations.by_poses(*each) for each in seen]
+    free, root = _directions(problem.reduced)
+    seen = [_scale_at(problem, place) for place in places]
+    by_points = [np.full(len(root), np.nan) if each is None else _by_poses(problem, *each) for each in seen]
     weight = _firmness(problem)
     g = np.array([*(_size_at(problem, part, weight) for part in stretches), *by_points])
     between = np.asarray(SCALE_INFLATION * np.sqrt(COVARIANCE_INFLATION) * cdist(g @ root, g @ root), np.float64)
@@ -99,7 +102,7 @@ def position_sigmas(submap: Submap, held: Collection[int]) -> dict[int, float]:
     if problem is None or not len(free):
         return sigma
     rows = (6 * np.searchsorted(ids, free)[:, None] + np.arange(6)).ravel()
-    values, vectors = np.linalg.eigh(problem.equations.reduced[np.ix_(rows, rows)])
+    values, vectors = np.linalg.eigh(problem.reduced[np.ix_(rows, rows)])
     by_place = vectors.reshape(len(free), 6, -1)[:, 3:]
     stiff = values > NO_TIE * float(np.median(values))
     variance = (by_place[:, :, stiff] ** 2 / values[stiff]).sum(axis=(1, 2))
@@ -107,7 +110,7 @@ def position_sigmas(submap: Submap, held: Collection[int]) -> dict[int, float]:
     return sigma | dict(zip(free[tied].tolist(), np.sqrt(variance[tied]).tolist(), strict=True))
 
 
-def normal_equations(submap: Submap, excess: Mapping[int, float]) -> MapEquations | None:
+def normal_equations(submap: Submap, excess: Mapping[int, float]) -> NormalEquations | None:
     """Return those of all keyframes, and of the landmarks that two of them see, if there are any.
 
     `excess`: of `noise_excess`.
@@ -131,11 +134,10 @@ def spread_by_poses(
     assert problem is not None, "landmarks are seen twice"
     row = np.searchsorted(problem.landmarks, landmark_ids).clip(0, len(problem.landmarks) - 1)
     known = problem.landmarks[row] == landmark_ids
-    equations = problem.equations
-    g = np.zeros((by_point.shape[1], *equations.xyz.shape))
+    g = np.zeros((by_point.shape[1], *problem.xyz.shape))
     g[:, row[known]] = by_point[known].transpose(1, 0, 2)
-    _, root = _directions(equations.reduced)
-    by_pose = np.array([equations.by_poses(np.zeros(len(root)), each) for each in g]) @ root
+    _, root = _directions(problem.reduced)
+    by_pose = np.array([_by_poses(problem, np.zeros(len(problem.reduced)), each) for each in g]) @ root
     return np.asarray(SCALE_INFLATION**2 * COVARIANCE_INFLATION * by_pose @ by_pose.T)
 
 
@@ -194,7 +196,7 @@ def answer_scale(question: ScaleQuestion) -> list[float]:
     problem = _linearise(question)
     if problem is None:
         return [np.inf] * len(question.places)
-    free, root = _directions(problem.equations.reduced)
+    free, root = _directions(problem.reduced)
     return [_sigma(problem, free, root, here, there) for here, there in question.places]
 
 
@@ -208,60 +210,113 @@ def _directions(reduced: FloatArray) -> tuple[FloatArray, FloatArray]:
     return vectors[:, ~stiff], vectors[:, stiff] / np.sqrt(values[N_GAUGE:][stiff])
 
 
-def _sigma(problem: MapEquations, free: FloatArray, root: FloatArray, here: IntArray, there: IntArray) -> float:
+def _sigma(problem: NormalEquations, free: FloatArray, root: FloatArray, here: IntArray, there: IntArray) -> float:
     """Ask the normal equations, with their `_directions`, for one pair of places."""
-    g = [problem.log_depth(ids) for ids in (there, here)]
+    g = [_scale_at(problem, ids) for ids in (there, here)]
     if g[0] is None or g[1] is None:
         return np.inf
     g_point = g[0][1] - g[1][1]
-    g_pose = problem.equations.by_poses(g[0][0] - g[1][0], g_point)
+    g_pose = _by_poses(problem, g[0][0] - g[1][0], g_point)
     if ((g_pose @ free) ** 2 > SLACK).any():
         return np.inf
-    of_points = np.einsum("ni,nij,nj->", g_point, problem.equations.inverse, g_point)
+    of_points = np.einsum("ni,nij,nj->", g_point, problem.inverse, g_point)
     variance = float(of_points + ((g_pose @ root) ** 2).sum())
     return float(np.sqrt(COVARIANCE_INFLATION * max(variance, 0.0)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class MapEquations:
-    """The normal equations of a map, and what their rows are."""
+class NormalEquations:
+    """The normal equations of F keyframes and N points, the points' blocks inverted."""
 
-    ids: IntArray  # (F,): keyframes
+    ids: IntArray  # (F,)
+    T_cam_submap: FloatArray  # (F, 4, 4)
     landmarks: IntArray  # (N,): ids, ascending
-    equations: NormalEquations
+    xyz: FloatArray  # (N, 3)
+    # Rows of each observation.
+    kf: IntArray  # (R,)
+    point: IntArray  # (R,)
+    inverse: FloatArray  # (N, 3, 3): covariances of the points, given the poses
+    H_cross: sparse.bsr_array  # (6 F, 3 N) sparse
+    reduced: FloatArray  # (6 F, 6 F): of the poses, the points eliminated
 
-    def log_depth(self, ids: IntArray) -> tuple[FloatArray, FloatArray] | None:
-        """Return `NormalEquations.log_depth` of keyframes by their ids."""
-        return self.equations.log_depth(np.searchsorted(self.ids, ids))
 
-
-def _linearise(question: ScaleQuestion) -> MapEquations | None:
+def _linearise(question: ScaleQuestion) -> NormalEquations | None:
     """Return the normal equations; none where no point is seen twice."""
     q = question
-    T = se3.inverse(q.T_submap_kf)
-    exact = np.zeros((3, 3))
-    good = pixel_chi2(q.K, T[q.kf], q.xyz[q.point], exact, q.uv_px, q.sigma_px) < PIXEL_CHI2  # not behind a camera
+    T, ids = se3.inverse(q.T_submap_kf), q.ids
+    all_xyz, n_rows = q.xyz[q.point], len(q.kf)
+    J_pose, J_point, good = np.zeros((n_rows, 2, 6)), np.zeros((n_rows, 2, 3)), np.zeros(n_rows, bool)
+    for f in range(len(ids)):
+        seen = np.flatnonzero(q.kf == f)
+        seen = seen[all_xyz[seen] @ T[f, 2, :3] + T[f, 2, 3] > 0]
+        J_pose[seen], J_point[seen] = projection_jacobians(q.K, T[f], all_xyz[seen])
+        predicted, _ = project_points(q.K, T[f], all_xyz[seen])
+        good[seen] = ((predicted - q.uv_px[seen]) ** 2).sum(1) < PIXEL_CHI2 * q.sigma_px[seen] ** 2
     # A point seen once says nothing of the poses.
     good &= np.bincount(q.point[good], minlength=len(q.xyz))[q.point] >= 2
+    kf, weight = q.kf[good], 1.0 / q.sigma_px[good] ** 2
+    J_pose, J_point = J_pose[good], J_point[good]
     points, point = np.unique(q.point[good], return_inverse=True)
     if len(points) == 0:
         return None
-    equations = eliminate_points(q.K, T, q.xyz[points], q.kf[good], point, q.sigma_px[good])
-    return MapEquations(q.ids, q.landmarks[points], equations)
+    order = np.lexsort((point, kf))  # as the blocks of a sparse matrix are stored
+    kf, point, weight, J_pose, J_point = kf[order], point[order], weight[order], J_pose[order], J_point[order]
+    n_f, n_p = len(ids), len(points)
+    weighted = (weight[:, None, None] * J_pose).transpose(0, 2, 1)
+    H_point = sum_by(point, (weight[:, None, None] * J_point).transpose(0, 2, 1) @ J_point, n_p)
+    H_point += SLACK * np.trace(H_point, axis1=1, axis2=2)[:, None, None] * np.eye(3)
+    inverse = np.asarray(np.linalg.inv(H_point), np.float64)
+    H_pose, blocks = sum_by(kf, weighted @ J_pose, n_f), weighted @ J_point
+    start = np.concatenate([[0], np.cumsum(np.bincount(kf, minlength=n_f))])
+    H_cross, through = (
+        sparse.bsr_array((values, point, start), shape=(6 * n_f, 3 * n_p))
+        for values in (blocks, blocks @ inverse[point])
+    )
+    reduced = -np.asarray((through @ H_cross.T).toarray())
+    for f in range(n_f):
+        reduced[6 * f : 6 * f + 6, 6 * f : 6 * f + 6] += H_pose[f]
+    reduced = (reduced + reduced.T) / 2
+    return NormalEquations(ids, T, q.landmarks[points], q.xyz[points], kf, point, inverse, H_cross, reduced)
 
 
-def _firmness(problem: MapEquations) -> FloatArray:
+def _scale_at(problem: NormalEquations, ids: IntArray) -> tuple[FloatArray, FloatArray] | None:
+    """Return the derivative of the mean log depth that some keyframes see: by the poses (6 F,), the points (N, 3).
+
+    A point counts by how well its own depth is known where the poses are.
+    """
+    seen = np.isin(problem.kf, np.searchsorted(problem.ids, ids))
+    if not seen.any():
+        return None
+    kf, point = problem.kf[seen], problem.point[seen]
+    T = problem.T_cam_submap[kf]
+    p = se3.act_each(T, problem.xyz[point])
+    by_pose = np.column_stack([p[:, 1], -p[:, 0], np.zeros((len(p), 3)), np.ones(len(p))]) / p[:, 2:]
+    by_point = T[:, 2, :3] / p[:, 2:]
+    share = 1.0 / np.maximum(np.einsum("ri,rij,rj->r", by_point, problem.inverse[point], by_point), TINY)
+    share /= share.sum()
+    g_pose = sum_by(kf, share[:, None] * by_pose, len(problem.ids))
+    g_point = sum_by(point, share[:, None] * by_point, len(problem.xyz))
+    return g_pose.reshape(-1), g_point
+
+
+def _by_poses(problem: NormalEquations, g_pose: FloatArray, g_point: FloatArray) -> FloatArray:
+    """Return a functional's derivative by the poses (6 F,) when the points follow them."""
+    follows = np.einsum("nij,nj->ni", problem.inverse, g_point)
+    return np.asarray(g_pose - problem.H_cross @ follows.reshape(-1), np.float64)
+
+
+def _firmness(problem: NormalEquations) -> FloatArray:
     """Return the inverse variance (F,) of each keyframe's position where the others are."""
     n = len(problem.ids)
-    H = problem.equations.reduced.reshape(n, 6, n, 6)[np.arange(n), :, np.arange(n)]
+    H = problem.reduced.reshape(n, 6, n, 6)[np.arange(n), :, np.arange(n)]
     H = H + (SLACK * np.trace(H, axis1=1, axis2=2) + TINY)[:, None, None] * np.eye(6)
     return np.asarray(1.0 / np.trace(np.linalg.inv(H)[:, 3:, 3:], axis1=1, axis2=2), np.float64)
 
 
-def _size_at(problem: MapEquations, ids: IntArray, weight: FloatArray) -> FloatArray:
+def _size_at(problem: NormalEquations, ids: IntArray, weight: FloatArray) -> FloatArray:
     """Return the derivative (6 F,) of the log of the path's size at some keyframes by the poses."""
     rows = np.searchsorted(problem.ids, ids)
-    T, share = problem.equations.T_cam_map[rows], weight[rows, None] / weight[rows].sum()
+    T, share = problem.T_cam_submap[rows], weight[rows, None] / weight[rows].sum()
     offset = se3.translation(se3.inverse(T))
     offset = offset - (share * offset).sum(axis=0)
     squares = max(float((share * offset**2).sum()), np.finfo(float).tiny)

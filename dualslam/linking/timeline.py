@@ -183,7 +183,7 @@ def deformation_covariance(model: PairModel, deformation: float) -> FloatArray:
 
 def _change_of_scale(model: PairModel, S_old_new: FloatArray, part: BoolArray) -> tuple[float, float]:
     """Return the change of scale, and its sigma, by which a part of the pairs fits best: one Gauss-Newton step."""
-    H, g = model.points.normal_equations(S_old_new, part.astype(np.float64))
+    H, g = model.normal_equations(S_old_new, part)
     try:
         step, C = np.linalg.solve(H, g), np.linalg.inv(H)
     except np.linalg.LinAlgError:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from dualslam.core.arrays import first_in_both
 from dualslam.core.geometry import se3, sim3, so3
-from dualslam.core.geometry.alignment import PointPairs, estimate_sim3_robust
+from dualslam.core.geometry.alignment import estimate_sim3_robust
 from dualslam.core.interfaces import Frontend
 from dualslam.core.matchers import Sighting
 from dualslam.core.noise_model import GROUP, MIN_CONSENSUS, SAME_WITHIN, TINY
@@ -51,8 +51,10 @@ class Pairs:
 
     def mahalanobis2(self, S: FloatArray) -> FloatArray:
         """Return the squared distances (N,) of the pairs under a similarity, by their noise."""
-        pairs = PointPairs(self.xyz_query, self.xyz_place, self.cov_query, self.cov_place)
-        return np.asarray(pairs.mahalanobis2(S[None])[0])
+        A = S[:3, :3]
+        residual = self.xyz_place - sim3.act(S, self.xyz_query)
+        covariance = self.cov_place + A @ self.cov_query @ A.T
+        return np.asarray((residual * np.linalg.solve(covariance, residual[..., None])[..., 0]).sum(1))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -50,8 +50,8 @@ class PoseCovariance:
         problem = normal_equations(submap, dict.fromkeys(submap.keyframes, 1.0))
         if problem is None:
             return None
-        kf, n, equations = problem.ids, len(problem.ids), problem.equations
-        information = equations.reduced + LOOSE_INFORMATION * np.eye(se3.DOF * n)
+        kf, n = problem.ids, len(problem.ids)
+        information = problem.reduced + LOOSE_INFORMATION * np.eye(se3.DOF * n)
         blocks = information.reshape(n, se3.DOF, n, se3.DOF)
         add_relative_poses(blocks, kf, submap.T_submap_kf, submap.relative_poses)
         if self.frame in submap.keyframes:
@@ -60,7 +60,7 @@ class PoseCovariance:
             by_pose[:, place : place + se3.DOF], own = np.eye(se3.DOF), np.zeros((se3.DOF, se3.DOF))
         else:
             ids, row = np.unique(submap.current_ids(self.landmark_ids), return_index=True)
-            spread = np.linalg.eigvalsh(equations.inverse)
+            spread = np.linalg.eigvalsh(problem.inverse)
             known = np.isin(ids, problem.landmarks[spread[:, 0] > MIN_EIGENVALUE * spread[:, 2]])
             ids, row = ids[known], row[known]
             if len(ids) < MIN_LANDMARKS:
@@ -72,8 +72,8 @@ class PoseCovariance:
             among = np.searchsorted(problem.landmarks, ids)
             by_point = np.zeros((se3.DOF, len(problem.landmarks), 3))
             by_point[:, among] = -np.einsum("ij,nkj,nkl->inl", pixels, J_pose, J_point)
-            shared = np.einsum("inj,njk->ink", by_point, equations.inverse).reshape(se3.DOF, -1)
-            by_pose, own = -(equations.H_cross @ shared.T).T, pixels + shared @ by_point.reshape(se3.DOF, -1).T
+            shared = np.einsum("inj,njk->ink", by_point, problem.inverse).reshape(se3.DOF, -1)
+            by_pose, own = -(problem.H_cross @ shared.T).T, pixels + shared @ by_point.reshape(se3.DOF, -1).T
         first, second = _gauge(submap)
         a, b = np.searchsorted(kf, (first, second)).tolist()
         baseline = se3.translation(submap.T_submap_kf[second]) - se3.translation(submap.T_submap_kf[first])

@@ -9,8 +9,8 @@ from __future__ import annotations
 import numpy as np
 
 from dualslam.core.geometry import se3
-from dualslam.core.geometry.normal_equations import eliminate_points
-from dualslam.core.noise_model import MIN_LANDMARKS
+from dualslam.core.geometry.projection import projection_jacobians
+from dualslam.core.noise_model import MIN_LANDMARKS, TINY
 from dualslam.core.types import Failure, FailureReason, FloatArray, IntArray, Track
 from dualslam.map.landmark_views import landmark_covariances
 from dualslam.map.submap import Submap
@@ -32,13 +32,24 @@ def gap_uncertainty(
     - `information` (N, 3, 3): what is known of the points without this camera: inverse covariances, which need not be
       of full rank.
     """
-    here, each = np.zeros(len(xyz), np.int64), np.arange(len(xyz))
-    equations = eliminate_points(K, T_cam_submap[None], xyz, here, each, sigma_px, information)
-    depth = equations.log_depth(here[:1])
-    assert depth is not None
-    rest, g_point = equations.by_poses(*depth), depth[1]
-    covariance = np.asarray(np.linalg.pinv(equations.reduced, hermitian=True), np.float64)
-    variance = np.einsum("ni,nij,nj->", g_point, equations.inverse, g_point) + rest @ covariance @ rest
+    n = len(xyz)
+    J_pose, J_point = projection_jacobians(K, T_cam_submap, xyz)
+    weight = (1.0 / sigma_px**2)[:, None, None]
+    H_points = information + J_point.swapaxes(1, 2) @ (weight * J_point)
+    H_pose = (J_pose.swapaxes(1, 2) @ (weight * J_pose)).sum(axis=0)
+    H_cross = J_pose.swapaxes(1, 2) @ (weight * J_point)
+    inverse = np.linalg.pinv(H_points, hermitian=True)
+    p = xyz @ se3.rotation(T_cam_submap).T + se3.translation(T_cam_submap)
+    g_pose = np.column_stack([p[:, 1], -p[:, 0], np.zeros((n, 3)), np.ones(n)]) / p[:, 2:]
+    g_point = T_cam_submap[2, :3] / p[:, 2:]
+    # A point counts by how well its own depth is known where the poses are.
+    share = 1.0 / np.maximum(np.einsum("ni,nij,nj->n", g_point, inverse, g_point), TINY)
+    share /= share.sum()
+    g_pose_mean, g_point = share @ g_pose, share[:, None] * g_point
+    reduced = H_pose - (H_cross @ inverse @ H_cross.swapaxes(1, 2)).sum(axis=0)
+    rest = g_pose_mean - np.einsum("nij,njk,nk->i", H_cross, inverse, g_point)
+    covariance = np.linalg.pinv(reduced, hermitian=True)
+    variance = np.einsum("ni,nij,nj->", g_point, inverse, g_point) + rest @ covariance @ rest
     return HESSIAN_INFLATION**2 * covariance, HESSIAN_INFLATION * float(np.sqrt(max(variance, 0.0)))
 
 

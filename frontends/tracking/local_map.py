@@ -81,6 +81,16 @@ class LocalMap:
             lm["descriptor"].take(landmark_ids, axis=0),
         )
 
+    def take(self, rows: NDArray[np.generic]) -> LocalMap:
+        """Return the rows given by index or mask."""
+        return LocalMap(
+            self.landmark_ids[rows],
+            self.xyz_mu[rows],
+            self.normal[rows],
+            self.reference_mu[rows],
+            self.descriptors[rows],
+        )
+
     def __len__(self) -> int:
         return len(self.landmark_ids)
 

@@ -11,13 +11,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from dualslam.core.bundle import ReadoutProblem
 from dualslam.core.camera.base import Camera
 from dualslam.core.config.settings import CameraConfig
 from dualslam.core.interfaces import Frontend
 from dualslam.core.noise_model import MISSING_INTERVALS
 from dualslam.core.types import Failure, Features, FloatArray, View
-from dualslam.frontends.tracking.map_readout import ask_readout
+from dualslam.frontends.tracking.map_readout import ReadoutQuestion, ask_readout
 from dualslam.frontends.tracking.pair_readout import READOUT_EVIDENCE, ReadoutEstimator, is_fast
 from dualslam.frontends.tracking.turning import correct_shutter, turn_between
 from dualslam.map.submap import Submap
@@ -145,7 +144,7 @@ class RollingShutter:
             self._estimator = None
         return True
 
-    def ask(self, submap: Submap, rates_rad_s: Mapping[int, FloatArray], camera: Camera) -> ReadoutProblem | Failure:
+    def ask(self, submap: Submap, rates_rad_s: Mapping[int, FloatArray], camera: Camera) -> ReadoutQuestion | Failure:
         """Ask a map for what of the readout is left in its keyframes, with how they turn (rad/s, in their own axes)."""
         return ask_readout(submap, rates_rad_s, camera.size_px)
 

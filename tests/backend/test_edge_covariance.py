@@ -5,12 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from dualslam.backend.edge_covariance import edge_covariances
+from dualslam.backend.edge_covariance import _linearise, _unit, edge_covariances
 from dualslam.backend.local_ba import bundle_adjust
 from dualslam.core.errors import SolverError
 from dualslam.core.geometry import se3, sim3
 from dualslam.map.anchors import RelativePose
 from dualslam.testing.atlas_world import DriftingMap
+from dualslam.testing.point_world import CAMERA
 
 FIRST, SECOND = 4, 16
 NO_DRIFT = np.zeros(7)
@@ -21,6 +22,41 @@ def stretch(seed: int = 0) -> DriftingMap:
     for k in range(21):
         world.add(k)
     return world
+
+
+def test_derivatives_against_numerical_ones() -> None:
+    submap = stretch().submap
+    window = np.arange(8)
+    kf, point, x, J_pose, J_point = _linearise(submap, window, 1e6)
+    row = 5
+    k = int(window[kf[row]])
+
+    def pixel(xi: np.ndarray, moved: np.ndarray) -> np.ndarray:
+        T = submap.T_submap_kf[k] @ se3.exp(xi)
+        p = se3.act(submap.T_submap_kf[k], x[row]) + moved
+        return np.asarray(CAMERA.project(((p - T[:3, 3]) @ T[:3, :3])[None])[0] / 0.5)
+
+    step = 1e-6
+    for i in range(6):
+        d = np.eye(6)[i] * step
+        np.testing.assert_allclose(
+            (pixel(d, np.zeros(3)) - pixel(-d, np.zeros(3))) / (2 * step), J_pose[row, :, i], rtol=1e-5, atol=1e-3
+        )
+    for i in range(3):
+        d = np.eye(3)[i] * step
+        np.testing.assert_allclose(
+            (pixel(np.zeros(6), d) - pixel(np.zeros(6), -d)) / (2 * step), J_point[row, :, i], rtol=1e-5, atol=1e-3
+        )
+    # With the points held, the unit at a keyframe is a matter of its own pose alone.
+    n_points = int(point.max()) + 1
+    R = submap.keyframe_poses(window)[:, :3, :3]
+    derivative = _unit(3, kf, point, x, R[3], np.zeros((n_points, 3, 48)), 8)
+    assert not derivative[:18].any()
+    assert not derivative[24:].any()
+    here = x[kf == 3]
+    for i in range(6):
+        moved = [np.log(se3.act(se3.inverse(se3.exp(s * np.eye(6)[i])), here)[:, 2]).mean() for s in (step, -step)]
+        np.testing.assert_allclose((moved[0] - moved[1]) / (2 * step), derivative[18 + i], rtol=1e-5, atol=1e-6)
 
 
 def test_against_solutions_of_noisy_pixels() -> None:

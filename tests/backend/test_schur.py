@@ -101,8 +101,7 @@ def test_neither_chunks_nor_the_order_of_poses_count(in_small_chunks: Callable[[
 
 def test_a_point_behind_a_camera_moves_no_pose() -> None:
     problem, loss = problem_of(10), partial(geman_mcclure, shape=SHAPE)
-    problem = replace(problem, fixed=np.arange(len(problem.fixed)) < 2)  # nor the scale, which nothing holds
-    alone = optimise(problem, loss, 20, 1e-12)
+    alone = optimise(problem, loss, 5, TOLERANCE)
     T = problem.T_submap_kf[:3]
     behind = T[0, :3, 3] - T[0, :3, 2]
     more = replace(
@@ -113,7 +112,7 @@ def test_a_point_behind_a_camera_moves_no_pose() -> None:
         uv_px=np.vstack([problem.uv_px, [[300.0, 200.0]] * 3]),
         sigma_px=np.append(problem.sigma_px, [1.0] * 3),
     )
-    t, r = pose_errors(optimise(more, loss, 20, 1e-12).state.T_submap_kf, alone.state.T_submap_kf)
+    t, r = pose_errors(optimise(more, loss, 5, TOLERANCE).state.T_submap_kf, alone.state.T_submap_kf)
     assert t.max() < 1e-6
     assert r.max() < 1e-6
 
@@ -142,7 +141,7 @@ def test_a_lens_is_found_with_poses_and_points() -> None:
     T, xyz = clean.T_submap_kf, clean.xyz_mu
     xyz_cam = np.einsum("rji,rj->ri", T[problem.kf, :3, :3], xyz[problem.point] - T[problem.kf, :3, 3])
     front = xyz_cam[:, 2] > 0.05
-    uv_px = lens.project(xyz_cam[:, :2] / xyz_cam[:, 2:], true, np.arange(len(xyz_cam)))
+    uv_px = lens.project(xyz_cam[:, :2] / xyz_cam[:, 2:], true)
     seen = replace(
         problem,
         T_submap_kf=T,
@@ -172,12 +171,10 @@ def test_derivatives_of_the_lens() -> None:
     rng, at = np.random.default_rng(0), np.array([0.05, 3.0, -2.0, 0.05, -0.02])
     lens = CorrectedLens(problem_of(3).K, np.eye(5))
     xy, h = rng.uniform(-0.8, 0.8, (20, 2)), 1e-6
-    rows = np.arange(len(xy))
-    project = partial(lens.project, rows=rows)
-    by_ray, by_lens = lens.derivatives(xy, at, rows)
+    by_ray, by_lens = lens.derivatives(xy, at)
     for i in range(2):
-        d = (project(xy + h * np.eye(2)[i], at) - project(xy - h * np.eye(2)[i], at)) / (2 * h)
+        d = (lens.project(xy + h * np.eye(2)[i], at) - lens.project(xy - h * np.eye(2)[i], at)) / (2 * h)
         np.testing.assert_allclose(by_ray[:, :, i], d, atol=1e-4)
     for i in range(5):
-        d = (project(xy, at + h * np.eye(5)[i]) - project(xy, at - h * np.eye(5)[i])) / (2 * h)
+        d = (lens.project(xy, at + h * np.eye(5)[i]) - lens.project(xy, at - h * np.eye(5)[i])) / (2 * h)
         np.testing.assert_allclose(by_lens[:, :, i], d, atol=1e-4)

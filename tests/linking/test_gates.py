@@ -71,6 +71,27 @@ def test_a_wrong_pose_tears_a_map_where_it_stands(layout, seed, ties):
     assert discontinuities[0] in (ONSET_ID, ONSET_ID + 3)
 
 
+def test_normal_equations_are_the_derivatives():
+    case = make_case("room", 0)
+    model = model_of(case)
+    used = model.mahalanobis2(case.S_old_new) < PAIR_CHI2
+    H, g = model.normal_equations(case.S_old_new, used)
+    A = case.S_old_new[:3, :3]
+    W = np.linalg.inv(model.covariance_old + A @ model.covariance_new @ A.T)[used]
+    q = model.pairs.xyz_new[used] - model.centre_new
+
+    def residual(x):
+        change = sim3.exp(x)
+        moved = q @ change[:3, :3].T + change[:3, 3] + model.centre_new
+        return model.pairs.xyz_old[used] - sim3.act(case.S_old_new, moved)
+
+    h = 1e-6
+    J = np.stack([(residual(h * e) - residual(-h * e)) / (2 * h) for e in np.eye(7)], -1)
+    r = residual(np.zeros(7))
+    np.testing.assert_allclose(H, np.einsum("nia,nij,njb->ab", J, W, J), rtol=1e-5, atol=1e-6 * np.abs(H).max())
+    np.testing.assert_allclose(g, -np.einsum("nia,nij,nj->a", J, W, r), rtol=1e-4, atol=1e-6 * np.abs(g).max())
+
+
 def test_every_keyframe_of_a_true_link_agrees_and_none_of_a_wrong_one():
     case = make_case("street", 1)
     model = model_of(case)

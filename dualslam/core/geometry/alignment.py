@@ -17,7 +17,7 @@ from dualslam.core.geometry import sim3, so3, symmetric3
 from dualslam.core.geometry.umeyama import Alignment, umeyama, umeyama_batch
 from dualslam.core.types import BoolArray, Failure, FailureReason, FloatArray
 
-__all__ = ["Alignment", "PointPairs", "Sim3Estimate", "estimate_sim3_robust", "umeyama", "umeyama_batch"]
+__all__ = ["Alignment", "Sim3Estimate", "estimate_sim3_robust", "umeyama", "umeyama_batch"]
 
 COVARIANCE_INFLATION = 1.5
 """The Hessian's covariance is a little optimistic (measured): it takes the gated points for the true inliers."""
@@ -50,8 +50,8 @@ class Sim3Estimate:
     """Summed squared Mahalanobis distance of the inliers over 3 n - 7: 1 is expected, or a little less for the gate."""
 
 
-class PointPairs:
-    """Matched points (N, 3) of two maps, their covariances (N, 3, 3), and how they fit a similarity."""
+class _Sim3Problem:
+    """The matched points and their covariances, as the planes that the scoring works on."""
 
     def __init__(self, src: FloatArray, dst: FloatArray, cov_src: FloatArray, cov_dst: FloatArray) -> None:
         self.src, self.dst, self.cov_src, self.cov_dst = src, dst, cov_src, cov_dst
@@ -106,7 +106,7 @@ def sensitivity(
 
     Arguments as for `estimate_sim3_robust`: its inliers. By points of src they are these times ``-s R``.
     """
-    problem = PointPairs(src, dst, cov_src, cov_dst)
+    problem = _Sim3Problem(src, dst, cov_src, cov_dst)
     J, WJ, _ = problem.linearise(S_dst_src, np.ones(len(src)))
     H = np.einsum("nia,nib->ab", J, WJ)
     return np.asarray(np.linalg.solve(H, WJ.transpose(0, 2, 1)))
@@ -144,7 +144,7 @@ def estimate_sim3_robust(
     n = len(rows)
     if n < max(min_inliers, 3):
         return Failure(FailureReason.TOO_FEW_MATCHES, f"{n} matches, {min_inliers} needed", {"n": float(n)})
-    problem = PointPairs(src[rows], dst[rows], cov_src[rows], cov_dst[rows])
+    problem = _Sim3Problem(src[rows], dst[rows], cov_src[rows], cov_dst[rows])
     hypotheses, n_tried = _ransac(problem, rng, chi2_gate, max_hypotheses, scale_bounds)
     if not len(hypotheses):
         return Failure(FailureReason.DEGENERATE, f"no triplet of {n} matches spans a plane", {"n": float(n)})
@@ -158,7 +158,7 @@ def _is_known(xyz: FloatArray, cov: FloatArray) -> BoolArray:
     return np.asarray(cov.trace(axis1=1, axis2=2) <= UNKNOWN**2 * extent2) | (extent2 == 0.0)
 
 
-def _best_refined(problem: PointPairs, hypotheses: FloatArray, gate: float) -> FloatArray:
+def _best_refined(problem: _Sim3Problem, hypotheses: FloatArray, gate: float) -> FloatArray:
     """Refine hypotheses, best first, and return the one of the least truncated cost.
 
     One whose inliers are nearly all among those of a refined one would come to the same, and is passed over.
@@ -180,7 +180,7 @@ def _best_refined(problem: PointPairs, hypotheses: FloatArray, gate: float) -> F
 
 
 def _ransac(
-    problem: PointPairs, rng: Generator, gate: float, max_hypotheses: int, scale_bounds: tuple[float, float]
+    problem: _Sim3Problem, rng: Generator, gate: float, max_hypotheses: int, scale_bounds: tuple[float, float]
 ) -> tuple[FloatArray, int]:
     """Return the best few hypotheses (M, 4, 4), best first, by truncated cost (MSAC), and how many were tried."""
     n = len(problem.src)
@@ -216,7 +216,7 @@ def _draw_triplets(rng: Generator, n: int, count: int) -> np.ndarray[tuple[int, 
     return np.stack([i, j, k], 1)
 
 
-def _refine(problem: PointPairs, S: FloatArray, gate: float, n_rounds: int = 4, n_iterations: int = 5) -> FloatArray:
+def _refine(problem: _Sim3Problem, S: FloatArray, gate: float, n_rounds: int = 4, n_iterations: int = 5) -> FloatArray:
     """Refine a hypothesis by rounds of Huber-weighted Gauss-Newton, inliers judged anew between them."""
     d2 = problem.mahalanobis2(S[None])[0]
     inliers = d2 < gate
@@ -242,7 +242,7 @@ def _refine(problem: PointPairs, S: FloatArray, gate: float, n_rounds: int = 4, 
 
 
 def _judge(
-    problem: PointPairs,
+    problem: _Sim3Problem,
     S: FloatArray,
     rows: np.ndarray[tuple[int], np.dtype[np.int64]],
     n_total: int,

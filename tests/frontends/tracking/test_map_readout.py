@@ -9,8 +9,6 @@ from typing import cast
 import numpy as np
 import pytest
 
-from dualslam.backend.readout import answer_readout
-from dualslam.core.bundle import ReadoutProblem
 from dualslam.core.estimates import KeyframeReport, ReadoutEstimate
 from dualslam.core.events import EventKind
 from dualslam.core.geometry import se3, so3
@@ -18,7 +16,7 @@ from dualslam.core.interfaces import VisualOdometry
 from dualslam.core.jobs import Ended
 from dualslam.core.noise_model import GATE_SIGMAS, INFLATION
 from dualslam.core.types import Failure, Features, FloatArray, Frame, IntArray, Keyframe, Track, View
-from dualslam.frontends.tracking.map_readout import MIN_KEYFRAMES, ask_readout
+from dualslam.frontends.tracking.map_readout import MIN_KEYFRAMES, ReadoutQuestion, answer_readout, ask_readout
 from dualslam.frontends.tracking.rolling_shutter import TurnMeter
 from dualslam.frontends.tracking.turning import correct_shutter, find_as_read, straighten
 from dualslam.frontends.tracking.visual import VisualFrontEnd
@@ -64,9 +62,10 @@ def made_map(readout_s: float, seed: int = 0) -> tuple[Submap, dict[int, FloatAr
 
 def told(submap: Submap, rates: dict[int, FloatArray]) -> ReadoutEstimate:
     question = ask_readout(submap, rates, CAMERA.size_px)
-    assert isinstance(question, ReadoutProblem)
+    assert isinstance(question, ReadoutQuestion)
+    before = question.T_cam_submap.copy()
     answer = answer_readout(question)
-    assert isinstance(answer, ReadoutEstimate)
+    assert np.array_equal(before, question.T_cam_submap)
     return answer
 
 

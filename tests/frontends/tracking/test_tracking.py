@@ -543,6 +543,7 @@ def test_local_map_predicts_what_the_camera_sees(world: PointWorld) -> None:
     np.testing.assert_allclose(prediction.uv_px, CAMERA.project(p), atol=1e-9)
     behind = se3.inverse(se3.from_parts(np.diag([-1.0, 1.0, -1.0]), np.zeros(3)))
     assert len(local.predict(behind, CAMERA.K, CAMERA, 1.2, 8).rows) == 0
+    assert len(local.take(prediction.rows)) == len(prediction.rows)
 
 
 @pytest.mark.parametrize(
