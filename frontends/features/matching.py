@@ -139,29 +139,29 @@ def match_epipolar(
     tolerance is the 95 % gate of both features' noise. Of the candidates, pairs are kept that are best for each other,
     clearly so, and share the common change of orientation.
 
-    - `rows_a` (A,), `rows_b` (B,): features that may be paired, usually those without a landmark. The others compete
-      all the same: where like things repeat, a feature whose partner is taken would be paired with its double.
+    - `rows_a` (A,), `rows_b` (B,): features that take part, usually those without a landmark.
     - `F_b_a` (3, 3): fundamental matrix on rectified pixels: the line in b of x_a is ``F_b_a @ x_a``, its sign and
       scale are free.
 
-    Returns Matches: rows of `a` (ascending), rows of `b`.
+    Returns Matches: rows of `a` (ascending in the order of `rows_a`), rows of `b`.
     """
-    if len(rows_a) == 0 or len(rows_b) == 0:
-        return NO_MATCHES
-    uv_a, uv_b = a.uv_rect_px, b.uv_rect_px
-    first, second = _near_lines(uv_a, uv_b, a.sigma_px, b.sigma_px, a.octave, b.octave, F_b_a, octave_tolerance)
+    uv_a, uv_b = a.uv_rect_px[rows_a], b.uv_rect_px[rows_b]
+    first, second = _near_lines(
+        uv_a, uv_b, a.sigma_px[rows_a], b.sigma_px[rows_b], a.octave[rows_a], b.octave[rows_b], F_b_a, octave_tolerance
+    )
     usable = _off_epipole(uv_a, F_b_a)[first] & _off_epipole(uv_b, F_b_a.T)[second]
     first, second = first[usable], second[usable]
     if len(first) == 0:
         return NO_MATCHES
-    distance = frontend.distance(a.descriptors.take(first, axis=0), b.descriptors.take(second, axis=0))
-    chosen = best_pairs(first, second, distance, b.octave[second], EPIPOLAR_RATIO, len(a), len(b))
+    distance = frontend.distance(a.descriptors.take(rows_a[first], axis=0), b.descriptors.take(rows_b[second], axis=0))
+    octave_b = b.octave[rows_b[second]]
+    chosen = best_pairs(first, second, distance, octave_b, EPIPOLAR_RATIO, len(rows_a), len(rows_b))
     # Best for b among all candidates, not only among those that are some feature's best.
-    chosen = np.intersect1d(chosen, best_per_group(second, distance, len(b)), assume_unique=True)
+    chosen = np.intersect1d(chosen, best_per_group(second, distance, len(rows_b)), assume_unique=True)
     chosen = chosen[distance[chosen] <= frontend.max_distance]
-    chosen = chosen[consistent_rotation(b.angle_rad[second[chosen]] - a.angle_rad[first[chosen]])]
-    chosen = chosen[np.isin(first[chosen], rows_a) & np.isin(second[chosen], rows_b)]
-    return Matches(np.stack([first[chosen], second[chosen]], axis=1), distance[chosen])
+    index = np.stack([rows_a[first[chosen]], rows_b[second[chosen]]], axis=1)
+    kept = consistent_rotation(b.angle_rad[index[:, 1]] - a.angle_rad[index[:, 0]])
+    return Matches(index[kept], distance[chosen][kept])
 
 
 def _are_finite(uv_px: FloatArray) -> BoolArray:

@@ -173,18 +173,6 @@ def test_epipolar_matches_are_right_and_complete() -> None:
     assert np.isin(matches.index[:, 1], rows_b).all()
 
 
-def test_a_double_is_not_paired_where_the_partner_is_taken() -> None:
-    # Of each point b shows a double as well, farther along its line, as in a row of like cars.
-    a, b, F_b_a, T_b_a, inverse_depth = two_views(60, seed=7)
-    ray = np.c_[a.uv_px, np.ones(60)] @ np.linalg.inv(K).T
-    double = (ray * 2.5 / inverse_depth[:, None]) @ T_b_a[:3, :3].T + T_b_a[:3, 3]
-    uv = np.r_[b.uv_px, (double @ K.T)[:, :2] / double[:, 2:]]
-    like = ("sigma_px", "scale", "octave", "angle_rad", "descriptors")
-    twice = Features(uv, uv, *(np.concatenate([getattr(b, name)] * 2) for name in like))
-    paired = match_epipolar(FRONTEND, a, twice, np.arange(60), np.arange(60, 120), F_b_a)
-    assert len(paired) < 0.1 * 60  # 5 % of the partners are outside their own gate
-
-
 @pytest.mark.parametrize("sign", [1.0, -3.0])
 def test_epipolar_matches_agree_with_a_loop(sign: float, monkeypatch: pytest.MonkeyPatch) -> None:
     a, b, F_b_a, _, _ = two_views(150, seed=6)
