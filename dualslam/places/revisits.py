@@ -171,7 +171,7 @@ class Revisits:
         """Measure the links of places again where a submap was refined since: the first time it was young."""
         atlas, verifier = self._record.atlas, self._parts.verifier
         for i, link in enumerate(atlas.links):
-            if link.kind not in (LinkKind.LOOP, LinkKind.MERGE) or not {link.a, link.b} & set(refined):
+            if link.kind not in (LinkKind.LOOP, LinkKind.MERGE) or not (link.a in refined or link.b in refined):
                 continue
             k_a, k_b = link.attached(atlas)
             a, b = atlas.submaps[link.a], atlas.submaps[link.b]
